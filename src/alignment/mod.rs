@@ -1,0 +1,1 @@
+//! Pose of one point set relative to another.

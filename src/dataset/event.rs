@@ -1,0 +1,144 @@
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use nalgebra::Isometry3;
+use serde::{Deserialize, Serialize};
+
+use crate::inertial::{ImuSample, Stamp};
+use crate::vision::{ColorImage, DepthImage};
+
+/// A color image and the depth image registered to it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RgbdFrame {
+    /// Header stamp of the color image.
+    pub stamp: Stamp,
+    pub color: ColorImage,
+    pub depth: DepthImage,
+}
+
+/// A pose from motion capture or another reference, as logged: its world need not be z-up.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TruthPose {
+    pub stamp: Stamp,
+    pub world_from_body: Isometry3<f64>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub enum Event {
+    Imu(ImuSample),
+    Frame(Box<RgbdFrame>),
+    Truth(TruthPose),
+}
+
+impl Event {
+    pub fn stamp(&self) -> Stamp {
+        match self {
+            Self::Imu(sample) => sample.stamp,
+            Self::Frame(frame) => frame.stamp,
+            Self::Truth(pose) => pose.stamp,
+        }
+    }
+}
+
+/// What a reader met: counts that end up in `metrics.json`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct ReadReport {
+    pub frames: u64,
+    pub imu_samples: u64,
+    pub truth_poses: u64,
+    /// Messages left out, by reason (`"color image: buffer too short"`).
+    pub skipped: BTreeMap<String, u64>,
+}
+
+impl ReadReport {
+    /// Counts a message left out; warns with `detail` the first time for each reason.
+    pub fn skip(&mut self, reason: &str, detail: impl std::fmt::Display) {
+        let count = self.skipped.entry(reason.to_owned()).or_default();
+        *count += 1;
+        if *count == 1 {
+            tracing::warn!("skipped: {reason} ({detail}); further ones are only counted");
+        }
+    }
+}
+
+/// What a log turned out to be when it was opened.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct LogSummary {
+    /// `"TUM RGB-D folder"`, `"ROS 1 bag"`, ...
+    pub kind: String,
+    /// Name under `configs/` (without `.toml`) that fits this layout.
+    pub config_name: String,
+    pub has_imu: bool,
+    pub has_truth: bool,
+    /// Chosen source for each role (`color`, `depth`, `imu`, `truth`): topic or file name.
+    pub sources: BTreeMap<String, String>,
+    /// Number of frames, where the log knows it without being read through.
+    pub frames: Option<u64>,
+}
+
+/// A log that is being read. Events come ordered by stamp; memory stays bounded.
+///
+/// A bad message is left out, counted in [`Log::report`] and warned of; it never ends the run.
+pub trait Log: Send {
+    fn summary(&self) -> &LogSummary;
+
+    /// The next event, or `None` at the end.
+    fn next_event(&mut self) -> Option<Event>;
+
+    fn report(&self) -> &ReadReport;
+}
+
+/// Where the streams of a log are and how their numbers are to be read.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LogConfig {
+    /// Topic of the color image; empty: chosen by message type.
+    pub color_topic: String,
+    /// Topic of the depth image; empty: chosen by message type and encoding.
+    pub depth_topic: String,
+    /// Topic of the IMU; empty: chosen by message type; `"none"`: not used.
+    pub imu_topic: String,
+    /// Topic of the reference poses; empty: chosen by message type; `"none"`: not used.
+    pub truth_topic: String,
+    /// Channel order of color images whose encoding is only `8UC3`: `"bgr"` or `"rgb"`.
+    pub color_8uc3: String,
+    /// Metres per unit of 16-bit depth (0.001 for millimetres, 0.0002 for TUM RGB-D).
+    pub depth_scale: f64,
+    /// Raw depth values, besides 0, that mean "none" (65535 in 7-Scenes).
+    pub depth_invalid: Vec<u16>,
+    /// Color and depth images further apart than this are no pair, s.
+    pub max_pair_difference: f64,
+    /// How far messages may arrive out of order before they are left out, s.
+    pub reorder_window: f64,
+}
+
+impl Default for LogConfig {
+    fn default() -> Self {
+        Self {
+            color_topic: String::new(),
+            depth_topic: String::new(),
+            imu_topic: String::new(),
+            truth_topic: String::new(),
+            color_8uc3: "bgr".to_owned(),
+            depth_scale: 0.001,
+            depth_invalid: vec![65535],
+            max_pair_difference: 0.02,
+            reorder_window: 0.5,
+        }
+    }
+}
+
+/// A log that cannot be read at all.
+#[derive(Debug, thiserror::Error)]
+pub enum LogError {
+    #[error("{path}: {source}")]
+    Io { path: PathBuf, source: std::io::Error },
+    #[error(
+        "{path}: not a log this program reads ({reason}); it reads .mcap, ROS 1 .bag, TUM RGB-D folders and 7-Scenes folders"
+    )]
+    UnknownFormat { path: PathBuf, reason: String },
+    #[error("{path}: {reason}")]
+    Corrupt { path: PathBuf, reason: String },
+    #[error("{path}: no {role} in this log; it has: {available}")]
+    MissingStream { path: PathBuf, role: &'static str, available: String },
+}

@@ -1,0 +1,27 @@
+use nalgebra::{Isometry3, SMatrix, Vector3};
+
+/// Covariance of (rotation, velocity, position, gyro bias, accelerometer bias): the rotation
+/// error is the rotation vector `e` of `R_true = R_est exp(e^)` (body frame, rad), velocity
+/// (m/s) and position (m) are in world coordinates, biases (rad/s, m/s^2) in the body's.
+pub type NavCovariance = SMatrix<f64, 15, 15>;
+
+/// First index of each block of three in a [`NavCovariance`].
+pub mod block {
+    pub const ROTATION: usize = 0;
+    pub const VELOCITY: usize = 3;
+    pub const POSITION: usize = 6;
+    pub const GYRO_BIAS: usize = 9;
+    pub const ACCEL_BIAS: usize = 12;
+}
+
+/// Point estimate of what a visual-inertial filter believes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NavState {
+    pub world_from_body: Isometry3<f64>,
+    /// Velocity of the body in world coordinates, m/s.
+    pub velocity: Vector3<f64>,
+    /// Gyroscope bias, rad/s: `measured = true + bias + noise`.
+    pub gyro_bias: Vector3<f64>,
+    /// Accelerometer bias, m/s^2.
+    pub accel_bias: Vector3<f64>,
+}

@@ -1,0 +1,1 @@
+//! The map of points: storage, queries, ageing.

@@ -1,0 +1,112 @@
+//! What the pipeline tells of one camera frame: the only thing that viewers and writers see.
+
+use nalgebra::{Isometry3, Vector3};
+use serde::Serialize;
+
+use crate::filter::{NavCovariance, NavState};
+use crate::inertial::Stamp;
+
+/// What became of a key point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum KeypointRole {
+    /// No usable depth.
+    NoDepth,
+    /// Depth, but neither matched nor inserted into the map.
+    Unmatched,
+    /// Matched to a map point and accepted by RANSAC and the gate.
+    Inlier,
+    /// Matched to a map point and rejected.
+    Outlier,
+    /// Became a new map point.
+    New,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct KeypointView {
+    /// Column and row, pixels.
+    pub pixel: [f32; 2],
+    /// Where the matched map point was predicted to appear, pixels.
+    pub predicted: Option<[f32; 2]>,
+    pub role: KeypointRole,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MapPointView {
+    /// World coordinates, m.
+    pub position: [f32; 3],
+    /// Root of the mean variance of the position, m.
+    pub sigma: f32,
+    /// Frames since the point was inserted.
+    pub age: u32,
+}
+
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct StepCounts {
+    pub features: usize,
+    pub with_depth: usize,
+    /// Map points that passed the distance and viewing direction rules.
+    pub candidates: usize,
+    pub matches: usize,
+    pub inliers: usize,
+    pub new_points: usize,
+    pub map_points: usize,
+}
+
+/// Wall time of the stages of one frame, s.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct StageTimes {
+    pub features: f64,
+    pub propagation: f64,
+    pub matching: f64,
+    pub ransac: f64,
+    pub update: f64,
+    pub map: f64,
+}
+
+impl StageTimes {
+    /// Stage names and values in the order of processing.
+    pub fn stages(&self) -> [(&'static str, f64); 6] {
+        [
+            ("features", self.features),
+            ("propagation", self.propagation),
+            ("matching", self.matching),
+            ("ransac", self.ransac),
+            ("update", self.update),
+            ("map", self.map),
+        ]
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub enum NoteLevel {
+    Info,
+    Warning,
+}
+
+/// An event worth a line in the log (initialised, gap, lost, recovered, ...).
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Note {
+    pub level: NoteLevel,
+    pub text: String,
+}
+
+/// The pipeline's account of one camera frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepReport {
+    /// Number of the frame in the log, from 0.
+    pub frame: u64,
+    pub stamp: Stamp,
+    pub state: NavState,
+    pub covariance: NavCovariance,
+    pub world_from_camera: Isometry3<f64>,
+    /// Proper singular values of the attitude's matrix Fisher part (`None` for Gaussian filters).
+    pub matrix_fisher_s: Option<Vector3<f64>>,
+    /// Mean squared normalised innovation per degree of freedom; about 1 when consistent.
+    pub innovation: Option<f64>,
+    pub counts: StepCounts,
+    pub times: StageTimes,
+    pub keypoints: Vec<KeypointView>,
+    /// All points of the map; filled only when the pipeline is asked to, since it is a copy.
+    pub map: Option<Vec<MapPointView>>,
+    pub notes: Vec<Note>,
+}

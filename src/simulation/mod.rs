@@ -1,0 +1,1 @@
+//! Worlds, motions and sensors.

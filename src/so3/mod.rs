@@ -1,0 +1,1 @@
+//! Rotations: exponential and logarithm, Jacobians, proper decompositions.

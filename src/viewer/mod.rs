@@ -1,0 +1,1 @@
+//! Rerun recordings; everything that mentions `rerun` is here.
