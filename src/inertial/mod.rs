@@ -1,7 +1,15 @@
-//! Sensor time, IMU samples and their noise.
+//! Sensor time, IMU samples and their noise, and how a belief about the motion of the body is
+//! carried through the kinematics.
 
 mod imu;
+mod initial;
+mod propagation;
 mod stamp;
+mod state;
 
 pub use imu::{ImuConfig, ImuSample};
+pub use initial::{InitialAttitude, StandstillCheck, StandstillConfig, attitude_from_gravity};
+pub(crate) use propagation::symmetrize;
+pub use propagation::{MotionModel, Propagator};
 pub use stamp::Stamp;
+pub use state::{Belief, NavCovariance, NavState, block};

@@ -25,3 +25,27 @@ pub struct NavState {
     /// Accelerometer bias, m/s^2.
     pub accel_bias: Vector3<f64>,
 }
+
+impl NavState {
+    pub fn is_finite(&self) -> bool {
+        let pose = &self.world_from_body;
+        let vectors = [pose.translation.vector, self.velocity, self.gyro_bias, self.accel_bias];
+        pose.rotation.coords.iter().chain(vectors.iter().flatten()).all(|x| x.is_finite())
+    }
+}
+
+/// A concentrated belief: the mode and the covariance of the error around it.
+///
+/// This is the Gaussian that W22 Theorem 3.4 makes of a matrix Fisher-Gaussian distribution
+/// (and back), so that it is the common ground of both filter families between updates.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Belief {
+    pub state: NavState,
+    pub covariance: NavCovariance,
+}
+
+impl Belief {
+    pub fn is_finite(&self) -> bool {
+        self.state.is_finite() && self.covariance.iter().all(|x| x.is_finite())
+    }
+}

@@ -1,0 +1,294 @@
+use nalgebra::{Isometry3, Matrix3, SMatrix, Translation3, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+
+use super::{Belief, ImuConfig, ImuSample, NavCovariance, block};
+use crate::so3;
+
+/// What carries the belief between two camera frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MotionModel {
+    /// Angular velocity and specific force are measured.
+    Inertial,
+    /// No IMU: angular velocity and velocity change only by white accelerations. The angular
+    /// velocity (body frame) is held in the gyro bias with the sign reversed, which makes a
+    /// gyroscope that always reads zero right; the accelerometer bias stays zero.
+    ConstantVelocity,
+}
+
+/// Propagates a [`Belief`] over the interval between two IMU samples.
+///
+/// The mean follows the strapdown equations with the averages of the samples at both ends; the
+/// covariance follows the error of [`NavCovariance`] to first order in the error and second
+/// order in the interval, with continuous-time noise densities. `O(15^3)` a step, no allocation.
+#[derive(Debug, Clone)]
+pub struct Propagator {
+    model: MotionModel,
+    gravity: Vector3<f64>,
+    gyro_noise: f64,
+    accel_noise: f64,
+    gyro_bias_walk: f64,
+    accel_bias_walk: f64,
+}
+
+impl Propagator {
+    pub fn inertial(config: &ImuConfig) -> Self {
+        Self {
+            model: MotionModel::Inertial,
+            gravity: Vector3::new(0.0, 0.0, -config.gravity),
+            gyro_noise: config.gyro_noise,
+            accel_noise: config.accel_noise,
+            gyro_bias_walk: config.gyro_bias_walk,
+            accel_bias_walk: config.accel_bias_walk,
+        }
+    }
+
+    /// `angular_acceleration` in rad/s^2/sqrt(Hz), `acceleration` in m/s^2/sqrt(Hz): white
+    /// noise densities.
+    pub fn constant_velocity(angular_acceleration: f64, acceleration: f64) -> Self {
+        Self {
+            model: MotionModel::ConstantVelocity,
+            gravity: Vector3::zeros(),
+            gyro_noise: 0.0,
+            accel_noise: acceleration,
+            gyro_bias_walk: angular_acceleration,
+            accel_bias_walk: 0.0,
+        }
+    }
+
+    pub fn model(&self) -> MotionModel {
+        self.model
+    }
+
+    /// Moves `belief` from the time of `from` to the time of `to`; an interval that is not
+    /// positive leaves it unchanged.
+    pub fn propagate(&self, belief: &mut Belief, from: &ImuSample, to: &ImuSample) {
+        let h = to.stamp.seconds_since(from.stamp);
+        if h > 0.0 {
+            let angular_velocity = (from.angular_velocity + to.angular_velocity) * 0.5;
+            let specific_force = (from.specific_force + to.specific_force) * 0.5;
+            self.step(belief, &angular_velocity, &specific_force, h);
+        }
+    }
+
+    /// Carries `belief` over `h` seconds without measurements (constant velocity model).
+    pub fn coast(&self, belief: &mut Belief, h: f64) {
+        if h > 0.0 {
+            self.step(belief, &Vector3::zeros(), &Vector3::zeros(), h);
+        }
+    }
+
+    fn step(&self, belief: &mut Belief, gyro: &Vector3<f64>, accel: &Vector3<f64>, h: f64) {
+        let state = &mut belief.state;
+        let turn = (gyro - state.gyro_bias) * h;
+        let force = accel - state.accel_bias;
+        let start = state.world_from_body.rotation.to_rotation_matrix();
+        let middle = *(start * so3::exp(&(turn * 0.5))).matrix();
+        let acceleration = middle * force + self.gravity;
+
+        let transition = transition(&middle, &turn, &force, h);
+        belief.covariance = transition * belief.covariance * transition.transpose() + self.noise(h);
+        symmetrize(&mut belief.covariance);
+
+        let position = state.world_from_body.translation.vector
+            + state.velocity * h
+            + acceleration * (0.5 * h * h);
+        let rotation = state.world_from_body.rotation * UnitQuaternion::from_scaled_axis(turn);
+        state.velocity += acceleration * h;
+        state.world_from_body = Isometry3::from_parts(
+            Translation3::from(position),
+            UnitQuaternion::new_normalize(rotation.into_inner()),
+        );
+    }
+
+    /// Covariance of the error that the white noises add over the step.
+    fn noise(&self, h: f64) -> NavCovariance {
+        let mut q = NavCovariance::zeros();
+        let accel = self.accel_noise.powi(2);
+        let walk = self.gyro_bias_walk.powi(2);
+        for k in 0..3 {
+            let mut add = |row: usize, column: usize, value: f64| {
+                q[(row + k, column + k)] += value;
+                if row != column {
+                    q[(column + k, row + k)] += value;
+                }
+            };
+            add(
+                block::ROTATION,
+                block::ROTATION,
+                self.gyro_noise.powi(2) * h + walk * h.powi(3) / 3.0,
+            );
+            add(block::ROTATION, block::GYRO_BIAS, -walk * h * h / 2.0);
+            add(block::GYRO_BIAS, block::GYRO_BIAS, walk * h);
+            add(block::VELOCITY, block::VELOCITY, accel * h);
+            add(block::VELOCITY, block::POSITION, accel * h * h / 2.0);
+            add(block::POSITION, block::POSITION, accel * h.powi(3) / 3.0);
+            add(block::ACCEL_BIAS, block::ACCEL_BIAS, self.accel_bias_walk.powi(2) * h);
+        }
+        q
+    }
+}
+
+/// Derivative of the error of [`NavCovariance`] after a step by the error before it, `middle`
+/// being the attitude half-way.
+fn transition(
+    middle: &Matrix3<f64>,
+    turn: &Vector3<f64>,
+    force: &Vector3<f64>,
+    h: f64,
+) -> NavCovariance {
+    let mut f = NavCovariance::identity();
+    let mut set = |row: usize, column: usize, value: Matrix3<f64>| {
+        f.fixed_view_mut::<3, 3>(row, column).copy_from(&value);
+    };
+    // Half-way the rotation error is `exp(-turn/2) e - (h/2) J_r(turn/2) db`.
+    let by_middle = -(middle * so3::hat(force));
+    let by_rotation = by_middle * so3::exp(&(turn * -0.5)).matrix();
+    let by_gyro_bias = -by_middle * so3::right_jacobian(&(turn * 0.5)) * (0.5 * h);
+    set(block::ROTATION, block::ROTATION, so3::exp(&-turn).into_inner());
+    set(block::ROTATION, block::GYRO_BIAS, -so3::right_jacobian(turn) * h);
+    for (row, factor) in [(block::VELOCITY, h), (block::POSITION, 0.5 * h * h)] {
+        set(row, block::ROTATION, by_rotation * factor);
+        set(row, block::GYRO_BIAS, by_gyro_bias * factor);
+        set(row, block::ACCEL_BIAS, -middle * factor);
+    }
+    set(block::POSITION, block::VELOCITY, Matrix3::identity() * h);
+    f
+}
+
+/// Removes the asymmetry that rounding leaves.
+pub(crate) fn symmetrize<const N: usize>(matrix: &mut SMatrix<f64, N, N>) {
+    for i in 0..N {
+        for j in 0..i {
+            let mean = 0.5 * (matrix[(i, j)] + matrix[(j, i)]);
+            matrix[(i, j)] = mean;
+            matrix[(j, i)] = mean;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::inertial::{NavState, Stamp};
+    use nalgebra::SVector;
+    use proptest::prelude::*;
+
+    fn state() -> NavState {
+        NavState {
+            world_from_body: Isometry3::new(
+                Vector3::new(1.0, 2.0, 3.0),
+                Vector3::new(0.4, -0.9, 1.3),
+            ),
+            velocity: Vector3::new(0.5, -1.0, 0.2),
+            gyro_bias: Vector3::new(0.01, -0.02, 0.03),
+            accel_bias: Vector3::new(-0.1, 0.2, 0.05),
+        }
+    }
+
+    fn propagator() -> Propagator {
+        Propagator::inertial(&ImuConfig::default())
+    }
+
+    fn perturbed(state: &NavState, error: &SVector<f64, 15>) -> NavState {
+        let part = |start: usize| error.fixed_rows::<3>(start).into_owned();
+        let turn = UnitQuaternion::from_scaled_axis(part(block::ROTATION));
+        NavState {
+            world_from_body: Isometry3::from_parts(
+                Translation3::from(
+                    state.world_from_body.translation.vector + part(block::POSITION),
+                ),
+                state.world_from_body.rotation * turn,
+            ),
+            velocity: state.velocity + part(block::VELOCITY),
+            gyro_bias: state.gyro_bias + part(block::GYRO_BIAS),
+            accel_bias: state.accel_bias + part(block::ACCEL_BIAS),
+        }
+    }
+
+    fn error(from: &NavState, to: &NavState) -> SVector<f64, 15> {
+        let mut error = SVector::zeros();
+        let mut set =
+            |start, value: Vector3<f64>| error.fixed_rows_mut::<3>(start).copy_from(&value);
+        let turn = from.world_from_body.rotation.inverse() * to.world_from_body.rotation;
+        set(block::ROTATION, turn.scaled_axis());
+        set(block::VELOCITY, to.velocity - from.velocity);
+        let position = |state: &NavState| state.world_from_body.translation.vector;
+        set(block::POSITION, position(to) - position(from));
+        set(block::GYRO_BIAS, to.gyro_bias - from.gyro_bias);
+        set(block::ACCEL_BIAS, to.accel_bias - from.accel_bias);
+        error
+    }
+
+    fn stepped(state: NavState, rate: &Vector3<f64>, force: &Vector3<f64>, h: f64) -> NavState {
+        let mut belief = Belief { state, covariance: NavCovariance::zeros() };
+        propagator().step(&mut belief, rate, force, h);
+        belief.state
+    }
+
+    proptest! {
+        #[test]
+        fn the_transition_is_the_derivative_of_the_step(
+            rate in [-6.0..6.0f64, -6.0..6.0, -6.0..6.0], force in [-20.0..20.0f64, -20.0..20.0, -20.0..20.0],
+            h in 0.001..0.05f64,
+        ) {
+            let (rate, force) = (Vector3::from(rate), Vector3::from(force));
+            let start = state();
+            let turn = (rate - start.gyro_bias) * h;
+            let middle = *(start.world_from_body.rotation.to_rotation_matrix()
+                * so3::exp(&(turn * 0.5))).matrix();
+            let analytic = transition(&middle, &turn, &(force - start.accel_bias), h);
+            let step = 1e-6;
+            for k in 0..15 {
+                let mut delta = SVector::<f64, 15>::zeros();
+                delta[k] = step;
+                let (plus, minus) = (perturbed(&start, &delta), perturbed(&start, &-delta));
+                let column = error(
+                    &stepped(minus, &rate, &force, h),
+                    &stepped(plus, &rate, &force, h),
+                ) / (2.0 * step);
+                prop_assert!((column - analytic.column(k)).norm() < 1e-7, "column {k}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_body_at_rest_stays_and_a_falling_one_falls() {
+        let rest = NavState {
+            world_from_body: Isometry3::identity(),
+            velocity: Vector3::zeros(),
+            gyro_bias: Vector3::zeros(),
+            accel_bias: Vector3::zeros(),
+        };
+        let felt = Vector3::new(0.0, 0.0, ImuConfig::default().gravity);
+        let still = stepped(rest, &Vector3::zeros(), &felt, 0.1);
+        assert!(error(&rest, &still).norm() < 1e-12);
+        let falling = stepped(rest, &Vector3::zeros(), &Vector3::zeros(), 0.1);
+        assert!((falling.velocity.z + 0.1 * felt.z).abs() < 1e-12);
+    }
+
+    #[test]
+    fn noise_adds_up_whatever_the_step() {
+        let quiet = Belief { state: state(), covariance: NavCovariance::zeros() };
+        let sample = |nanos| ImuSample {
+            stamp: Stamp::from_nanos(nanos),
+            angular_velocity: quiet.state.gyro_bias,
+            specific_force: Vector3::new(0.0, 0.0, 9.8),
+        };
+        let run = |steps: i64| {
+            let mut belief = quiet;
+            let length = 200_000_000 / steps;
+            for k in 0..steps {
+                propagator().propagate(&mut belief, &sample(k * length), &sample((k + 1) * length));
+            }
+            belief.covariance
+        };
+        let (coarse, fine) = (run(20), run(200));
+        for k in 0..15 {
+            assert!((coarse[(k, k)] / fine[(k, k)] - 1.0).abs() < 0.02, "{k}");
+        }
+        let mut unchanged = quiet;
+        propagator().propagate(&mut unchanged, &sample(5), &sample(5));
+        assert_eq!(unchanged, quiet);
+    }
+}
