@@ -1,0 +1,251 @@
+use nalgebra::{Matrix3, Matrix6, Rotation3, SMatrix, SVector, Vector3, Vector6};
+
+/// A point measured in the body frame and the map point it was matched to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PointPair {
+    /// Measured position in body coordinates, m.
+    pub in_body: Vector3<f64>,
+    /// Covariance `A` of the measurement in body coordinates, m^2.
+    pub body_covariance: Matrix3<f64>,
+    /// Position in the map, world coordinates, m.
+    pub in_world: Vector3<f64>,
+    /// Covariance `B` of the map point in world coordinates, m^2 (zero: known exactly).
+    pub world_covariance: Matrix3<f64>,
+}
+
+impl PointPair {
+    /// `(R A R^T + B)^-1`; `None` if that covariance is not positive definite.
+    fn weight(&self, world_from_body: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+        let rotated = world_from_body * self.body_covariance * world_from_body.transpose();
+        let cholesky = (rotated + self.world_covariance).cholesky()?;
+        let weight = cholesky.inverse();
+        weight.iter().all(|x| x.is_finite()).then_some(weight)
+    }
+}
+
+/// Down-weighting of residuals that the Gaussian model does not explain.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum RobustKernel {
+    /// Every residual counts in full.
+    None,
+    /// Huber: the weight falls as `scale / m` beyond a Mahalanobis distance `m` of `scale`.
+    Huber { scale: f64 },
+}
+
+impl RobustKernel {
+    fn weight(self, mahalanobis_squared: f64) -> f64 {
+        match self {
+            Self::Huber { scale } if mahalanobis_squared > scale * scale => {
+                scale / mahalanobis_squared.sqrt()
+            }
+            _ => 1.0,
+        }
+    }
+}
+
+/// The Gaussian likelihood of a pose given point pairs, as one quadratic form in
+/// `r = vec(R)` (columns stacked) and `t` (position of the body relative to [`Self::origin`]):
+///
+/// `-2 log L = sum_i |J_i (r, t) - p_i|^2_{W_i}`, `J_i = [p'_i^T (x) I, I]`,
+/// `W_i = (R A_i R^T + B_i)^-1` at the attitude it was linearised at (exact if `A_i` is
+/// isotropic). It is the sum (5.66) of W22 without its `O(N^2)` terms: one pass over the points,
+/// and nothing after it depends on their number.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseInformation {
+    /// World position that `t` is relative to; near the body, so that far-off worlds cost no
+    /// digits.
+    pub origin: Vector3<f64>,
+    pub rr: SMatrix<f64, 9, 9>,
+    pub rt: SMatrix<f64, 9, 3>,
+    pub tt: Matrix3<f64>,
+    pub eta_r: SVector<f64, 9>,
+    pub eta_t: Vector3<f64>,
+    /// The form at `r = 0`, `t = 0`.
+    pub constant: f64,
+    /// Number of pairs that entered.
+    pub points: usize,
+}
+
+impl PoseInformation {
+    /// Accumulates `pairs` with the weights taken at the pose (`world_from_body`, `position`).
+    ///
+    /// Pairs without a positive definite covariance are left out. `O(N)`, no allocation.
+    pub fn accumulate(
+        pairs: &[PointPair],
+        world_from_body: &Rotation3<f64>,
+        position: &Vector3<f64>,
+        kernel: RobustKernel,
+    ) -> Self {
+        let mut sum = Self {
+            origin: *position,
+            rr: SMatrix::zeros(),
+            rt: SMatrix::zeros(),
+            tt: Matrix3::zeros(),
+            eta_r: SVector::zeros(),
+            eta_t: Vector3::zeros(),
+            constant: 0.0,
+            points: 0,
+        };
+        for pair in pairs {
+            if let Some(weight) = pair.weight(world_from_body.matrix()) {
+                let target = pair.in_world - position;
+                let residual = world_from_body * pair.in_body - target;
+                let distance = residual.dot(&(weight * residual));
+                sum.add(&pair.in_body, &target, &(weight * kernel.weight(distance)));
+            }
+        }
+        sum
+    }
+
+    fn add(&mut self, in_body: &Vector3<f64>, target: &Vector3<f64>, weight: &Matrix3<f64>) {
+        let weighted = weight * target;
+        for a in 0..3 {
+            for b in a..3 {
+                let block = weight * (in_body[a] * in_body[b]);
+                let mut upper = self.rr.fixed_view_mut::<3, 3>(3 * a, 3 * b);
+                upper += block;
+                if a != b {
+                    let mut lower = self.rr.fixed_view_mut::<3, 3>(3 * b, 3 * a);
+                    lower += block;
+                }
+            }
+            let mut rt = self.rt.fixed_view_mut::<3, 3>(3 * a, 0);
+            rt += weight * in_body[a];
+            let mut eta = self.eta_r.fixed_rows_mut::<3>(3 * a);
+            eta += weighted * in_body[a];
+        }
+        self.tt += weight;
+        self.eta_t += weighted;
+        self.constant += target.dot(&weighted);
+        self.points += 1;
+    }
+
+    /// The form's value, i.e. the weighted sum of squared residuals, at a pose.
+    pub fn cost(&self, world_from_body: &Rotation3<f64>, position: &Vector3<f64>) -> f64 {
+        let r = vectorize(world_from_body.matrix());
+        let t = position - self.origin;
+        r.dot(&(self.rr * r)) + 2.0 * r.dot(&(self.rt * t)) + t.dot(&(self.tt * t))
+            - 2.0 * (self.eta_r.dot(&r) + self.eta_t.dot(&t))
+            + self.constant
+    }
+
+    /// Information matrix and vector of `(e, t)` with `R = world_from_body exp(e^)`, linearised
+    /// at `e = 0` and `t = 0`: what an extended Kalman filter makes of the likelihood.
+    pub fn linearized(&self, world_from_body: &Rotation3<f64>) -> (Matrix6<f64>, Vector6<f64>) {
+        let r = vectorize(world_from_body.matrix());
+        let d = rotated_vector_by_rotation(world_from_body.matrix());
+        let mut information = Matrix6::<f64>::zeros();
+        let et = d.transpose() * self.rt;
+        information.fixed_view_mut::<3, 3>(0, 0).copy_from(&(d.transpose() * self.rr * d));
+        information.fixed_view_mut::<3, 3>(0, 3).copy_from(&et);
+        information.fixed_view_mut::<3, 3>(3, 0).copy_from(&et.transpose());
+        information.fixed_view_mut::<3, 3>(3, 3).copy_from(&self.tt);
+        let mut vector = Vector6::zeros();
+        vector.fixed_rows_mut::<3>(0).copy_from(&(d.transpose() * (self.eta_r - self.rr * r)));
+        vector.fixed_rows_mut::<3>(3).copy_from(&(self.eta_t - self.rt.transpose() * r));
+        (information, vector)
+    }
+}
+
+/// `vec(R)`: the columns of a matrix, stacked.
+pub fn vectorize(matrix: &Matrix3<f64>) -> SVector<f64, 9> {
+    SVector::from_column_slice(matrix.as_slice())
+}
+
+/// Derivative of `vec(R exp(e^))` by `e` at `e = 0` (9x3).
+pub fn rotated_vector_by_rotation(rotation: &Matrix3<f64>) -> SMatrix<f64, 9, 3> {
+    let mut derivative = SMatrix::<f64, 9, 3>::zeros();
+    for k in 0..3 {
+        let turned = rotation * Vector3::ith(k, 1.0).cross_matrix();
+        derivative.set_column(k, &vectorize(&turned));
+    }
+    derivative
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use approx::assert_relative_eq;
+    use proptest::prelude::*;
+
+    fn vector(range: f64) -> impl Strategy<Value = Vector3<f64>> {
+        [-range..range, -range..range, -range..range].prop_map(|v| Vector3::new(v[0], v[1], v[2]))
+    }
+
+    fn covariance() -> impl Strategy<Value = Matrix3<f64>> {
+        (vector(1.0), vector(1.0), vector(1.0)).prop_map(|(a, b, c)| {
+            let m = Matrix3::from_columns(&[a, b, c]);
+            m * m.transpose() + Matrix3::identity() * 0.1
+        })
+    }
+
+    fn pair() -> impl Strategy<Value = PointPair> {
+        (vector(5.0), covariance(), vector(5.0), covariance()).prop_map(|(p, a, q, b)| PointPair {
+            in_body: p,
+            body_covariance: a,
+            in_world: q,
+            world_covariance: b,
+        })
+    }
+
+    /// The sum of squared residuals with weights frozen at `at`, written out point by point.
+    fn direct_cost(
+        pairs: &[PointPair],
+        at: &Rotation3<f64>,
+        rotation: &Rotation3<f64>,
+        position: &Vector3<f64>,
+    ) -> f64 {
+        let cost = |pair: &PointPair| {
+            let covariance = at.matrix() * pair.body_covariance * at.matrix().transpose()
+                + pair.world_covariance;
+            let residual = rotation * pair.in_body + position - pair.in_world;
+            residual.dot(&(covariance.try_inverse().unwrap() * residual))
+        };
+        pairs.iter().map(cost).sum()
+    }
+
+    proptest! {
+        #[test]
+        fn the_form_is_the_sum_of_squared_residuals(
+            pairs in proptest::collection::vec(pair(), 0..8),
+            at in vector(2.0), turn in vector(2.0), origin in vector(50.0), shift in vector(1.0),
+        ) {
+            let (at, rotation) = (Rotation3::new(at), Rotation3::new(turn));
+            let form = PoseInformation::accumulate(&pairs, &at, &origin, RobustKernel::None);
+            let position = origin + shift;
+            let direct = direct_cost(&pairs, &at, &rotation, &position);
+            prop_assert!((form.cost(&rotation, &position) - direct).abs() < 1e-9 * (1.0 + form.constant));
+        }
+
+        #[test]
+        fn the_linearisation_is_the_gradient(
+            pairs in proptest::collection::vec(pair(), 1..8), at in vector(2.0),
+        ) {
+            let at = Rotation3::new(at);
+            let origin = Vector3::new(1.0, 2.0, 3.0);
+            let form = PoseInformation::accumulate(&pairs, &at, &origin, RobustKernel::None);
+            let (information, vector) = form.linearized(&at);
+            let h = 1e-5;
+            for k in 0..6 {
+                let cost = |step: f64| {
+                    let mut delta = Vector6::zeros();
+                    delta[k] = step;
+                    let turned = at * Rotation3::new(delta.fixed_rows::<3>(0).into_owned());
+                    form.cost(&turned, &(origin + delta.fixed_rows::<3>(3)))
+                };
+                let slope = -(cost(h) - cost(-h)) / (4.0 * h);
+                let scale = 1.0 + form.constant + information.norm();
+                prop_assert!((slope - vector[k]).abs() < 1e-6 * scale, "{k}: {slope} {}", vector[k]);
+            }
+            prop_assert!((information - information.transpose()).norm() < 1e-9 * information.norm());
+        }
+    }
+
+    #[test]
+    fn huber_leaves_small_residuals_and_tames_large_ones() {
+        let kernel = RobustKernel::Huber { scale: 2.0 };
+        assert_relative_eq!(kernel.weight(3.9), 1.0);
+        assert_relative_eq!(kernel.weight(100.0), 0.2);
+        assert_relative_eq!(RobustKernel::None.weight(100.0), 1.0);
+    }
+}
