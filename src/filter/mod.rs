@@ -1,6 +1,13 @@
 //! Estimators: beliefs over attitude, velocity, position and biases, and how measurements
 //! change them.
 
-mod state;
+mod gaussian;
+mod matrix_fisher_gaussian;
+mod visual;
 
-pub use state::{NavCovariance, NavState, block};
+pub use gaussian::Mekf;
+pub use matrix_fisher_gaussian::MfgFilter;
+pub use visual::{
+    FilterConfig, FilterKind, MapEstimate, MapTreatment, UpdateOutcome, VisualInertialFilter,
+    point_by_pose,
+};

@@ -1,0 +1,82 @@
+//! The multiplicative extended Kalman filter: the Gaussian rival of the MFG filters.
+
+use nalgebra::{Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
+
+use super::visual::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
+use crate::alignment::{PointPair, PoseInformation};
+use crate::inertial::{Belief, ImuSample, Propagator, block, symmetrize};
+
+/// Attitude error in the body frame, one linearisation an update, at the predicted state.
+#[derive(Debug, Clone)]
+pub struct Mekf {
+    config: FilterConfig,
+    propagator: Propagator,
+    belief: Belief,
+}
+
+impl Mekf {
+    pub fn new(config: &FilterConfig, propagator: Propagator, belief: Belief) -> Self {
+        Self { config: config.clone(), propagator, belief }
+    }
+
+    fn correct(&mut self, information: &PoseInformation) -> Option<()> {
+        let state = &mut self.belief.state;
+        let rotation = state.world_from_body.rotation.to_rotation_matrix();
+        let (lambda, vector) = information.linearized(&rotation);
+
+        // Information form of the gain, so that the cost does not depend on the number of points
+        // and degenerate geometry needs no special case.
+        let prior = self.belief.covariance;
+        let mut by_pose = SMatrix::<f64, 15, 6>::zeros();
+        by_pose.fixed_columns_mut::<3>(0).copy_from(&prior.fixed_columns::<3>(block::ROTATION));
+        by_pose.fixed_columns_mut::<3>(3).copy_from(&prior.fixed_columns::<3>(block::POSITION));
+        let pose = super::visual::pose_covariance(&prior);
+        let inner = (Matrix6::identity() + lambda * pose).try_inverse()?;
+        let correction: SVector<f64, 15> = by_pose * (inner * vector);
+        let mut covariance = prior - by_pose * (inner * lambda) * by_pose.transpose();
+        symmetrize(&mut covariance);
+
+        let part = |start: usize| correction.fixed_rows::<3>(start).into_owned();
+        let turn: Vector3<f64> = part(block::ROTATION);
+        let turned = state.world_from_body.rotation * UnitQuaternion::from_scaled_axis(turn);
+        state.world_from_body.rotation = UnitQuaternion::new_normalize(turned.into_inner());
+        state.world_from_body.translation.vector += part(block::POSITION);
+        state.velocity += part(block::VELOCITY);
+        state.gyro_bias += part(block::GYRO_BIAS);
+        state.accel_bias += part(block::ACCEL_BIAS);
+        self.belief.covariance = covariance;
+        Some(())
+    }
+}
+
+impl VisualInertialFilter for Mekf {
+    fn belief(&self) -> &Belief {
+        &self.belief
+    }
+
+    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) {
+        self.propagator.propagate(&mut self.belief, from, to);
+    }
+
+    fn coast(&mut self, seconds: f64) {
+        self.propagator.coast(&mut self.belief, seconds);
+    }
+
+    fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome> {
+        let pose = &self.belief.state.world_from_body;
+        let rotation = pose.rotation.to_rotation_matrix();
+        let kernel = self.config.kernel();
+        let information =
+            PoseInformation::accumulate(pairs, &rotation, &pose.translation.vector, kernel);
+        if information.points == 0 {
+            return None;
+        }
+        let innovation = normalized_innovation(&information, &self.belief)?;
+        self.correct(&information)?;
+        Some(UpdateOutcome { innovation, points: information.points })
+    }
+
+    fn matrix_fisher_s(&self) -> Option<Vector3<f64>> {
+        None
+    }
+}

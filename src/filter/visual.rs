@@ -1,0 +1,258 @@
+//! What all visual-inertial filters share: the trait, the map treatment, the point posteriors.
+
+use std::fmt;
+use std::str::FromStr;
+
+use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
+use serde::{Deserialize, Serialize};
+
+use super::{Mekf, MfgFilter};
+use crate::alignment::{PointPair, PoseInformation, RobustKernel};
+use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block, symmetrize};
+
+/// What the filter assumes of map points once they are in the map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MapTreatment {
+    /// A point stays where it was inserted (`mfgd`, `mekfd`; W22 5.2.1).
+    Fixed,
+    /// A point is a Gaussian of its own, independent of the pose, and every measurement refines
+    /// it (`mfgr`, `mekfr`; W22 5.2.3).
+    Uncertain,
+}
+
+/// The filters of `replay --filter`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FilterKind {
+    Mfgd,
+    Mfgr,
+    Mekfd,
+    Mekfr,
+}
+
+impl FilterKind {
+    pub const ALL: [Self; 4] = [Self::Mfgr, Self::Mfgd, Self::Mekfr, Self::Mekfd];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Mfgd => "mfgd",
+            Self::Mfgr => "mfgr",
+            Self::Mekfd => "mekfd",
+            Self::Mekfr => "mekfr",
+        }
+    }
+
+    pub fn map_treatment(self) -> MapTreatment {
+        match self {
+            Self::Mfgd | Self::Mekfd => MapTreatment::Fixed,
+            Self::Mfgr | Self::Mekfr => MapTreatment::Uncertain,
+        }
+    }
+
+    /// A filter of this kind that starts from `belief`.
+    pub fn start(
+        self,
+        config: &FilterConfig,
+        propagator: Propagator,
+        belief: Belief,
+    ) -> Box<dyn VisualInertialFilter> {
+        match self {
+            Self::Mfgd | Self::Mfgr => Box::new(MfgFilter::new(config, propagator, belief)),
+            Self::Mekfd | Self::Mekfr => Box::new(Mekf::new(config, propagator, belief)),
+        }
+    }
+}
+
+impl fmt::Display for FilterKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl FromStr for FilterKind {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        Self::ALL.into_iter().find(|kind| kind.name() == text).ok_or_else(|| {
+            let names: Vec<_> = Self::ALL.iter().map(|kind| kind.name()).collect();
+            format!("unknown filter `{text}`; there are: {}", names.join(", "))
+        })
+    }
+}
+
+/// Settings of the measurement update and of the initial uncertainty.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct FilterConfig {
+    /// Mahalanobis distance beyond which the weight of a point falls (Huber); 0: never.
+    pub huber: f64,
+    /// Times the attitude is re-linearised within one update of the MFG filters.
+    pub relinearizations: usize,
+    /// Factor on the covariance of every point measurement, for what the sensor model leaves out
+    /// (errors shared by neighbouring points).
+    pub measurement_inflation: f64,
+    /// Standard deviation of the initial velocity, m/s.
+    pub velocity_sd: f64,
+    /// Standard deviation of the initial position, m.
+    pub position_sd: f64,
+    /// Standard deviation of the initial roll and pitch from a standing start, degrees.
+    pub tilt_sd_deg: f64,
+    /// The same from the mean of a moving start, degrees.
+    pub moving_tilt_sd_deg: f64,
+    /// Standard deviation of the initial heading, degrees.
+    pub heading_sd_deg: f64,
+    /// Standard deviation of each velocity component after a moving start, m/s.
+    pub moving_velocity_sd: f64,
+    /// White angular acceleration of the constant-velocity model (no IMU), rad/s^2/sqrt(Hz).
+    pub angular_acceleration: f64,
+    /// White acceleration of the constant-velocity model (no IMU), m/s^2/sqrt(Hz).
+    pub acceleration: f64,
+    /// Standard deviation of the initial angular velocity of the constant-velocity model, rad/s.
+    pub angular_velocity_sd: f64,
+}
+
+impl Default for FilterConfig {
+    fn default() -> Self {
+        Self {
+            huber: 2.0,
+            relinearizations: 2,
+            measurement_inflation: 1.0,
+            velocity_sd: 0.1,
+            position_sd: 1e-3,
+            tilt_sd_deg: 1.0,
+            moving_tilt_sd_deg: 5.0,
+            heading_sd_deg: 0.1,
+            moving_velocity_sd: 1.0,
+            angular_acceleration: 5.0,
+            acceleration: 5.0,
+            angular_velocity_sd: 1.0,
+        }
+    }
+}
+
+impl FilterConfig {
+    pub(super) fn kernel(&self) -> RobustKernel {
+        if self.huber > 0.0 {
+            RobustKernel::Huber { scale: self.huber }
+        } else {
+            RobustKernel::None
+        }
+    }
+}
+
+/// What an update did, besides changing the belief.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UpdateOutcome {
+    /// Squared normalised innovation per degree of freedom; about 1 when consistent.
+    pub innovation: f64,
+    /// Pairs that entered.
+    pub points: usize,
+}
+
+/// Position of a map point and its covariance, world coordinates (m, m^2).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MapEstimate {
+    pub position: Vector3<f64>,
+    pub covariance: Matrix3<f64>,
+}
+
+/// A recursive estimator of attitude, velocity, position and IMU biases that is corrected by
+/// points measured in the body frame and matched to a map.
+pub trait VisualInertialFilter: Send {
+    /// The current belief, in the concentrated form of W22 Theorem 3.4.
+    fn belief(&self) -> &Belief;
+
+    /// Moves the belief from the time of `from` to that of `to`.
+    fn propagate(&mut self, from: &ImuSample, to: &ImuSample);
+
+    /// Moves the belief on by `seconds` without an IMU.
+    fn coast(&mut self, seconds: f64);
+
+    /// Conditions the belief on matched points; no points leave it unchanged.
+    fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome>;
+
+    /// Proper singular values of the attitude's matrix Fisher part, if the filter has one.
+    fn matrix_fisher_s(&self) -> Option<Vector3<f64>>;
+}
+
+impl dyn VisualInertialFilter {
+    /// Covariance of (rotation, position), the blocks that a point measurement sees.
+    pub fn pose_covariance(&self) -> Matrix6<f64> {
+        pose_covariance(&self.belief().covariance)
+    }
+
+    /// A new map point from its measurement, by W22 (5.84), (5.85).
+    ///
+    /// For [`MapTreatment::Fixed`] the covariance is that of the measurement alone.
+    pub fn insert(
+        &self,
+        treatment: MapTreatment,
+        in_body: &Vector3<f64>,
+        body_covariance: &Matrix3<f64>,
+    ) -> MapEstimate {
+        let pose = self.belief().state.world_from_body;
+        let rotation = pose.rotation.to_rotation_matrix();
+        let measured = rotation.matrix() * body_covariance * rotation.matrix().transpose();
+        let covariance = match treatment {
+            MapTreatment::Fixed => measured,
+            MapTreatment::Uncertain => {
+                let j = point_by_pose(rotation.matrix(), in_body);
+                measured + j * self.pose_covariance() * j.transpose()
+            }
+        };
+        MapEstimate { position: rotation * in_body + pose.translation.vector, covariance }
+    }
+
+    /// Posterior of the map point of `pair` given the updated pose, by `K = B (A + B)^-1`:
+    /// `E[p] = (I - K) p + K (R p' + t)`, `Cov[p] = (I - K) B + K J C J^T K^T`, the short form
+    /// of W22 Theorem 5.8 and (G.6)-(G.8). `None` if `A + B` is singular.
+    pub fn refine(&self, pair: &PointPair) -> Option<MapEstimate> {
+        let pose = self.belief().state.world_from_body;
+        let rotation = pose.rotation.to_rotation_matrix();
+        let measured = rotation.matrix() * pair.body_covariance * rotation.matrix().transpose();
+        let weight = (measured + pair.world_covariance).cholesky()?.inverse();
+        let gain = pair.world_covariance * weight;
+        let seen = rotation * pair.in_body + pose.translation.vector;
+        let j = gain * point_by_pose(rotation.matrix(), &pair.in_body);
+        let mut covariance = (Matrix3::identity() - gain) * pair.world_covariance
+            + j * self.pose_covariance() * j.transpose();
+        symmetrize(&mut covariance);
+        Some(MapEstimate { position: pair.in_world + gain * (seen - pair.in_world), covariance })
+    }
+}
+
+/// Derivative of `R p' + t` by (body-frame rotation error, position), 3x6.
+pub fn point_by_pose(rotation: &Matrix3<f64>, in_body: &Vector3<f64>) -> SMatrix<f64, 3, 6> {
+    let mut j = SMatrix::<f64, 3, 6>::zeros();
+    j.fixed_view_mut::<3, 3>(0, 0).copy_from(&-(rotation * in_body.cross_matrix()));
+    j.fixed_view_mut::<3, 3>(0, 3).copy_from(&Matrix3::identity());
+    j
+}
+
+/// The (rotation, position) blocks of a [`NavCovariance`].
+pub fn pose_covariance(covariance: &NavCovariance) -> Matrix6<f64> {
+    let mut pose = Matrix6::zeros();
+    let starts = [block::ROTATION, block::POSITION];
+    for (i, from_row) in starts.into_iter().enumerate() {
+        for (j, from_column) in starts.into_iter().enumerate() {
+            pose.fixed_view_mut::<3, 3>(3 * i, 3 * j)
+                .copy_from(&covariance.fixed_view::<3, 3>(from_row, from_column));
+        }
+    }
+    pose
+}
+
+/// Squared normalised innovation per degree of freedom of `information` against the prior:
+/// `(r^T W r - b^T P (I + Lambda P)^-1 b) / 3N`, the matrix inversion lemma's form of
+/// `r^T (W^-1 + H P H^T)^-1 r`, so that it costs the same for any number of points.
+pub(super) fn normalized_innovation(information: &PoseInformation, belief: &Belief) -> Option<f64> {
+    let pose = &belief.state.world_from_body;
+    let rotation = pose.rotation.to_rotation_matrix();
+    let (lambda, vector) = information.linearized(&rotation);
+    let prior = pose_covariance(&belief.covariance);
+    let explained = prior * (Matrix6::identity() + lambda * prior).lu().solve(&vector)?;
+    let total = information.cost(&rotation, &pose.translation.vector);
+    let dof = 3.0 * information.points as f64;
+    Some((total - vector.dot(&explained)).max(0.0) / dof)
+}
