@@ -1,4 +1,6 @@
-use nalgebra::{Isometry3, Matrix3, Matrix4, Point2, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{
+    Isometry3, Matrix2, Matrix2x3, Matrix3, Matrix4, Point2, Rotation3, UnitQuaternion, Vector3,
+};
 use serde::{Deserialize, Serialize};
 
 /// Intrinsics and mounting of the color camera.
@@ -50,6 +52,21 @@ impl CameraConfig {
     }
 }
 
+impl CameraConfig {
+    /// Where the camera images what a camera without distortion would image at `pixel`: the
+    /// radial-tangential model of OpenCV's `calib3d`.
+    pub fn distort(&self, pixel: Point2<f64>) -> Point2<f64> {
+        let [k1, k2, p1, p2, k3] = self.distortion;
+        let (x, y) = ((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
+        let r2 = x * x + y * y;
+        let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+        Point2::new(
+            self.fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + self.cx,
+            self.fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + self.cy,
+        )
+    }
+}
+
 /// A pinhole camera without distortion (images and key points are undistorted before).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PinholeCamera {
@@ -77,6 +94,19 @@ impl PinholeCamera {
             (pixel.y - self.cy) / self.fy * depth,
             depth,
         )
+    }
+
+    /// Covariance (px^2) of the pixel of a point (m) with `covariance` (m^2), both in camera
+    /// coordinates, to first order; infinite or NaN at depth 0.
+    pub fn pixel_covariance(
+        &self,
+        point: &Vector3<f64>,
+        covariance: &Matrix3<f64>,
+    ) -> Matrix2<f64> {
+        let (u, v) = (self.fx / point.z, self.fy / point.z);
+        let jacobian =
+            Matrix2x3::new(u, 0.0, -u * point.x / point.z, 0.0, v, -v * point.y / point.z);
+        jacobian * covariance * jacobian.transpose()
     }
 }
 

@@ -1,11 +1,26 @@
-//! Images, cameras and depth; with the feature `vision`, the ORB front end.
+//! Images, cameras and depth; features, their matching and the search for a consistent pose;
+//! with the feature `vision`, the ORB front end.
 //!
 //! OpenCV is mentioned only inside the feature-gated part of this module.
 
 mod camera;
 mod depth;
+mod feature;
+mod frame;
 mod image;
+mod matching;
+#[cfg(feature = "vision")]
+mod orb;
+pub mod ransac;
+#[cfg(feature = "vision")]
+mod select;
 
 pub use camera::{CameraConfig, PinholeCamera};
-pub use depth::DepthConfig;
+pub use depth::{DepthConfig, DepthReading};
+pub use feature::{Descriptor, Feature, FeatureConfig, PointMeasurement};
+pub use frame::RgbdFrame;
 pub use image::{ColorImage, DepthImage, PixelFormat};
+pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
+#[cfg(feature = "vision")]
+pub use orb::{Link, OrbExtractor, VisionError};
+pub use ransac::{Correspondence, RansacConfig, estimate_pose};
