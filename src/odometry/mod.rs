@@ -1,7 +1,58 @@
 //! The pipeline that joins front end, map and filter.
 
+mod event;
+mod init;
+mod pipeline;
 mod report;
+mod runner;
+mod truth;
 
+use serde::{Deserialize, Serialize};
+
+use crate::filter::FilterConfig;
+use crate::inertial::{ImuConfig, StandstillConfig};
+use crate::map::MapConfig;
+use crate::vision::{CameraConfig, MatchingConfig, RansacConfig};
+
+pub use event::{Event, TruthPose};
+pub use init::{InitConfig, InitMode};
+pub use pipeline::{FrontEndFrame, Odometry, OdometryStats};
 pub use report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
+pub use runner::{FrontEnd, RunOptions, run};
+pub use truth::{TruthConfig, TruthTrack, Up, z_up_from_reference};
+
+/// Where in the image a map point is looked for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SearchConfig {
+    /// Radius around the predicted pixel when the prediction is certain, pixels; three standard
+    /// deviations of the prediction are added.
+    pub min_radius: f64,
+    /// Largest radius, pixels.
+    pub max_radius: f64,
+    /// With fewer matches than this the search is repeated with the largest radius.
+    pub min_matches: usize,
+}
+
+impl Default for SearchConfig {
+    fn default() -> Self {
+        Self { min_radius: 8.0, max_radius: 120.0, min_matches: 30 }
+    }
+}
+
+/// The settings of the pipeline behind the front end.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct OdometryConfig {
+    pub imu: ImuConfig,
+    pub camera: CameraConfig,
+    pub search: SearchConfig,
+    pub matching: MatchingConfig,
+    pub ransac: RansacConfig,
+    pub map: MapConfig,
+    pub filter: FilterConfig,
+    pub init: InitConfig,
+    pub standstill: StandstillConfig,
+    pub truth: TruthConfig,
+}

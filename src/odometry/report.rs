@@ -3,8 +3,8 @@
 use nalgebra::{Isometry3, Vector3};
 use serde::Serialize;
 
-use crate::filter::{NavCovariance, NavState};
 use crate::inertial::Stamp;
+use crate::inertial::{NavCovariance, NavState};
 
 /// What became of a key point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

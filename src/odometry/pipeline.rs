@@ -1,0 +1,619 @@
+use std::collections::VecDeque;
+use std::time::Instant;
+
+use nalgebra::{Isometry3, Matrix3, Point2, Point3, UnitQuaternion, Vector3};
+
+use super::init::{Attempt, Evidence, Initializer};
+use super::report::{
+    KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
+};
+use super::truth::TruthTrack;
+use super::{OdometryConfig, TruthPose};
+use crate::alignment::PointPair;
+use crate::filter::{FilterKind, MapTreatment, VisualInertialFilter, point_by_pose};
+use crate::inertial::{Belief, ImuSample, Propagator, Stamp};
+use crate::map::{Map, MapPoint, Sighting};
+use crate::vision::{
+    Correspondence, Feature, Match, PinholeCamera, PointMeasurement, Prediction, RgbdFrame,
+    estimate_pose, match_guided,
+};
+
+/// A frame whose features have been found.
+#[derive(Debug)]
+pub struct FrontEndFrame {
+    pub frame: Box<RgbdFrame>,
+    pub features: Vec<Feature>,
+    /// Wall time that finding them took, s.
+    pub seconds: f64,
+}
+
+/// Visual-inertial odometry: IMU samples, frames and reference poses go in, in order of time;
+/// one [`StepReport`] a frame comes out of [`Self::step`], as soon as the IMU has reached it.
+///
+/// A step costs `O(F + M)` in features and map points; the belief is of fixed size.
+pub struct Odometry {
+    config: OdometryConfig,
+    kind: FilterKind,
+    seed: u64,
+    camera: PinholeCamera,
+    body_from_camera: Isometry3<f64>,
+    initializer: Initializer,
+    has_imu: bool,
+    ended: bool,
+    imu: VecDeque<ImuSample>,
+    frames: VecDeque<(u64, FrontEndFrame)>,
+    truth: TruthTrack,
+    frames_in: u64,
+    now: Option<Stamp>,
+    running: Option<Running>,
+    waiting_reason: Option<String>,
+    map_every: u64,
+    stats: OdometryStats,
+}
+
+/// Counts over the run, for `metrics.json`.
+#[derive(Debug, Clone, Default, PartialEq, serde::Serialize)]
+pub struct OdometryStats {
+    pub frames_processed: u64,
+    /// Frames left out before the filter was initialised.
+    pub frames_before_initialization: u64,
+    /// Frames without enough matched points for an update.
+    pub frames_without_update: u64,
+    pub imu_gaps: u64,
+    /// How the run was initialised; `None` if it never was.
+    pub initialization: Option<String>,
+    /// Why it was not, when it was not.
+    pub waiting_reason: Option<String>,
+}
+
+/// How long a frame waits for the IMU to reach it before the gap is bridged, s.
+const IMU_PATIENCE: f64 = 1.0;
+
+/// What exists once the filter has started.
+struct Running {
+    filter: Box<dyn VisualInertialFilter>,
+    map: Map,
+    /// Last sample used, its stamp being the time of the belief (interpolated at frames).
+    last_imu: Option<ImuSample>,
+    time: Stamp,
+}
+
+impl Odometry {
+    /// `None` if `camera.imu_from_camera` is no rigid
+    /// motion.
+    pub fn new(
+        config: &OdometryConfig,
+        kind: FilterKind,
+        seed: u64,
+        has_imu: bool,
+    ) -> Option<Self> {
+        let body_from_camera =
+            if has_imu { config.camera.imu_from_camera()? } else { Isometry3::identity() };
+        let initializer = Initializer {
+            init: config.init.clone(),
+            standstill: config.standstill.clone(),
+            truth: config.truth.clone(),
+            imu: config.imu.clone(),
+            filter: config.filter.clone(),
+            level_without_imu: camera_looking_ahead(),
+        };
+        Some(Self {
+            config: config.clone(),
+            kind,
+            seed,
+            camera: PinholeCamera::from(&config.camera),
+            body_from_camera,
+            initializer,
+            has_imu,
+            ended: false,
+            imu: VecDeque::new(),
+            frames: VecDeque::new(),
+            truth: TruthTrack::default(),
+            frames_in: 0,
+            now: None,
+            running: None,
+            waiting_reason: None,
+            map_every: 0,
+            stats: OdometryStats::default(),
+        })
+    }
+
+    /// Reports carry a copy of the map every `n` frames; 0: never.
+    pub fn report_map_every(&mut self, n: u64) {
+        self.map_every = n;
+    }
+
+    pub fn push_imu(&mut self, sample: ImuSample) {
+        self.advance(sample.stamp);
+        self.imu.push_back(sample);
+    }
+
+    pub fn push_truth(&mut self, pose: TruthPose) {
+        let stamp = pose.stamp.offset_by(self.config.truth.time_offset);
+        self.advance(stamp);
+        self.truth.push(TruthPose { stamp, ..pose });
+    }
+
+    pub fn push_frame(&mut self, frame: FrontEndFrame) {
+        self.advance(frame.frame.stamp.offset_by(self.config.camera.time_offset));
+        self.frames.push_back((self.frames_in, frame));
+        self.frames_in += 1;
+    }
+
+    /// No more data will come: what waits is processed with what there is.
+    pub fn end(&mut self) {
+        self.ended = true;
+    }
+
+    pub fn stats(&self) -> OdometryStats {
+        OdometryStats { waiting_reason: self.waiting_reason.clone(), ..self.stats.clone() }
+    }
+
+    pub fn truth(&self) -> &TruthTrack {
+        &self.truth
+    }
+
+    /// The map as it stands, in order of insertion.
+    pub fn map(&self) -> Vec<MapPointView> {
+        self.running
+            .as_ref()
+            .map(|running| map_views(&running.map, self.frames_in))
+            .unwrap_or_default()
+    }
+
+    fn advance(&mut self, stamp: Stamp) {
+        self.now = Some(self.now.map_or(stamp, |now| now.max(stamp)));
+    }
+
+    /// Processes the oldest waiting frame if everything up to its time is there. The frame comes
+    /// back with its report.
+    pub fn step(&mut self) -> Option<(StepReport, Box<RgbdFrame>)> {
+        let mut notes = Vec::new();
+        while self.running.is_none() {
+            notes.extend(self.try_start()?);
+        }
+        let (_, front) = self.frames.front()?;
+        let stamp = self.frame_time(front);
+        let imu_reached = self.imu.back().is_some_and(|sample| sample.stamp >= stamp);
+        let late = self.now.is_some_and(|now| now.seconds_since(stamp) > IMU_PATIENCE);
+        if self.has_imu && !imu_reached && !self.ended && !late {
+            return None;
+        }
+        let (number, front) = self.frames.pop_front()?;
+        let report = self.process(number, &front, stamp, notes)?;
+        Some((report, front.frame))
+    }
+
+    fn frame_time(&self, frame: &FrontEndFrame) -> Stamp {
+        frame.frame.stamp.offset_by(self.config.camera.time_offset)
+    }
+
+    /// One attempt to start at the oldest frame; `None` if there is nothing to do now.
+    fn try_start(&mut self) -> Option<Option<Note>> {
+        let (_, front) = self.frames.front()?;
+        let first_frame = self.frame_time(front);
+        self.imu.make_contiguous();
+        let evidence = Evidence {
+            imu: self.has_imu.then_some(self.imu.as_slices().0),
+            truth: &self.truth,
+            first_frame,
+            now: self.now?,
+            ended: self.ended,
+        };
+        match self.initializer.attempt(&evidence) {
+            Attempt::Wait => None,
+            Attempt::NextFrame(reason) => {
+                if self.waiting_reason.is_none() {
+                    tracing::warn!("not initialised at {first_frame} s: {reason}; waiting");
+                }
+                self.waiting_reason = Some(reason);
+                self.frames.pop_front();
+                self.stats.frames_before_initialization += 1;
+                Some(None)
+            }
+            Attempt::Ready { belief, how } => {
+                let text = format!("initialised at {first_frame} s: {how}");
+                tracing::info!("{text}");
+                self.stats.initialization = Some(how);
+                self.waiting_reason = None;
+                self.start(*belief, first_frame);
+                Some(Some(Note { level: NoteLevel::Info, text }))
+            }
+        }
+    }
+
+    fn start(&mut self, belief: Belief, time: Stamp) {
+        let filter = &self.config.filter;
+        let propagator = if self.has_imu {
+            Propagator::inertial(&self.config.imu)
+        } else {
+            Propagator::constant_velocity(filter.angular_acceleration, filter.acceleration)
+        };
+        let mut last_imu = None;
+        while self.imu.front().is_some_and(|sample| sample.stamp <= time) {
+            last_imu = self.imu.pop_front();
+        }
+        self.running = Some(Running {
+            filter: self.kind.start(filter, propagator, belief),
+            map: Map::new(&self.config.map),
+            last_imu: last_imu.map(|sample| ImuSample { stamp: time, ..sample }),
+            time,
+        });
+    }
+
+    fn process(
+        &mut self,
+        number: u64,
+        front: &FrontEndFrame,
+        stamp: Stamp,
+        mut notes: Vec<Note>,
+    ) -> Option<StepReport> {
+        let running = self.running.as_mut()?;
+        let view = View {
+            config: &self.config,
+            camera: &self.camera,
+            body_from_camera: &self.body_from_camera,
+            size: (front.frame.color.width(), front.frame.color.height()),
+            seed: self.seed.wrapping_add(number),
+        };
+        let mut times = StageTimes { features: front.seconds, ..StageTimes::default() };
+        let mut clock = StageClock::start();
+        self.stats.imu_gaps += running.propagate_to(stamp, &mut self.imu, view.config, &mut notes);
+        times.propagation = clock.lap();
+
+        let features = Features::of(&front.features);
+        let (candidates, matches) = running.find_matches(&features, &view);
+        times.matching = clock.lap();
+
+        let inliers = running.find_inliers(&features, &matches, &view);
+        times.ransac = clock.lap();
+
+        let treatment = self.kind.map_treatment();
+        let innovation = running.update(&matches, &inliers, treatment, &view);
+        if innovation.is_none() && number > 0 && !running.map.is_empty() {
+            self.stats.frames_without_update += 1;
+        }
+        times.update = clock.lap();
+
+        let roles = running.grow_map(number, &features, &matches, &inliers, treatment, &view);
+        times.map = clock.lap();
+
+        self.stats.frames_processed += 1;
+        let wants_map = self.map_every > 0 && number.is_multiple_of(self.map_every);
+        let belief = running.filter.belief();
+        let count = |role| roles.iter().filter(|(r, _)| *r == role).count();
+        Some(StepReport {
+            frame: number,
+            stamp: front.frame.stamp,
+            state: belief.state,
+            covariance: belief.covariance,
+            world_from_camera: belief.state.world_from_body * self.body_from_camera,
+            matrix_fisher_s: running.filter.matrix_fisher_s(),
+            innovation,
+            counts: StepCounts {
+                features: front.features.len(),
+                with_depth: features.seen.len(),
+                candidates,
+                matches: matches.len(),
+                inliers: inliers.len(),
+                new_points: count(KeypointRole::New),
+                map_points: running.map.len(),
+            },
+            times,
+            keypoints: keypoint_views(&front.features, &roles),
+            map: wants_map.then(|| map_views(&running.map, number)),
+            notes,
+        })
+    }
+}
+
+/// What the stages of a frame need to know besides the belief and the map.
+struct View<'a> {
+    config: &'a OdometryConfig,
+    camera: &'a PinholeCamera,
+    body_from_camera: &'a Isometry3<f64>,
+    size: (usize, usize),
+    seed: u64,
+}
+
+/// The features of a frame, those with depth set apart.
+struct Features<'a> {
+    all: &'a [Feature],
+    /// Features with depth, in order.
+    seen: Vec<Feature>,
+    /// For each of them its index in `all` and its measurement.
+    measured: Vec<(usize, PointMeasurement)>,
+}
+
+impl<'a> Features<'a> {
+    fn of(all: &'a [Feature]) -> Self {
+        let with_depth = || all.iter().enumerate().filter(|(_, f)| f.measurement.is_some());
+        Self {
+            all,
+            seen: with_depth().map(|(_, f)| f.clone()).collect(),
+            measured: with_depth().filter_map(|(i, f)| Some((i, f.measurement?))).collect(),
+        }
+    }
+}
+
+/// A feature with depth and the map point that it looks like.
+#[derive(Debug, Clone, Copy)]
+struct Association {
+    /// Index into `Features::seen`.
+    feature: usize,
+    /// Id in the map.
+    point: u64,
+    predicted: Point2<f64>,
+    correspondence: Correspondence,
+}
+
+impl Running {
+    /// Carries the belief to `stamp`; gives the number of gaps in the IMU data on the way.
+    fn propagate_to(
+        &mut self,
+        stamp: Stamp,
+        imu: &mut VecDeque<ImuSample>,
+        config: &OdometryConfig,
+        notes: &mut Vec<Note>,
+    ) -> u64 {
+        let Some(mut last) = self.last_imu.or_else(|| imu.front().copied()) else {
+            self.filter.coast(stamp.seconds_since(self.time));
+            self.time = stamp;
+            return 0;
+        };
+        let mut gaps = 0;
+        let mut advance = |filter: &mut Box<dyn VisualInertialFilter>, from: &ImuSample, to| {
+            let to: ImuSample = to;
+            let interval = to.stamp.seconds_since(from.stamp);
+            if interval > config.imu.max_gap {
+                gaps += 1;
+                let text = format!("IMU gap of {interval:.3} s before {} s", to.stamp);
+                notes.push(Note { level: NoteLevel::Warning, text });
+            }
+            filter.propagate(from, &to);
+        };
+        last.stamp = self.time;
+        while let Some(sample) = imu.front().copied().filter(|sample| sample.stamp <= stamp) {
+            imu.pop_front();
+            advance(&mut self.filter, &last, sample);
+            last = sample;
+        }
+        let at_frame = match imu.front() {
+            Some(next) => interpolate(&last, next, stamp),
+            None => ImuSample { stamp, ..last },
+        };
+        advance(&mut self.filter, &last, at_frame);
+        self.last_imu = Some(at_frame);
+        self.time = stamp;
+        gaps
+    }
+
+    fn world_from_camera(&self, view: &View) -> Isometry3<f64> {
+        self.filter.belief().state.world_from_body * view.body_from_camera
+    }
+
+    /// Number of map points that should be visible, and the features that look like one.
+    fn find_matches(&mut self, features: &Features, view: &View) -> (usize, Vec<Association>) {
+        let world_from_camera = self.world_from_camera(view);
+        let ids = self.map.candidates(&world_from_camera, view.camera, view.size.0, view.size.1);
+        let mut associations = self.match_candidates(&ids, features, view, false);
+        if associations.len() < view.config.search.min_matches {
+            associations = self.match_candidates(&ids, features, view, true);
+        }
+        (ids.len(), associations)
+    }
+
+    fn match_candidates(
+        &self,
+        ids: &[u64],
+        features: &Features,
+        view: &View,
+        everywhere: bool,
+    ) -> Vec<Association> {
+        let world_from_camera = self.world_from_camera(view);
+        let search = &view.config.search;
+        let pose_covariance = self.filter.pose_covariance();
+        let rotation = self.filter.belief().state.world_from_body.rotation;
+        let predict = |point: &MapPoint| -> Option<Prediction> {
+            let in_camera =
+                world_from_camera.inverse_transform_point(&Point3::from(point.position)).coords;
+            let pixel = view.camera.project(&in_camera)?;
+            // Spread of the prediction in the image: turning by `e` moves it by about `f e`,
+            // moving by `d` by `f d / z`.
+            let in_body = (view.body_from_camera * Point3::from(in_camera)).coords;
+            let by_pose = point_by_pose(rotation.to_rotation_matrix().matrix(), &in_body);
+            let spread = by_pose * pose_covariance * by_pose.transpose() + point.covariance;
+            let sigma =
+                view.camera.fx * spread.symmetric_eigenvalues().max().max(0.0).sqrt() / in_camera.z;
+            let radius = (search.min_radius + 3.0 * sigma).min(search.max_radius);
+            let radius = if everywhere { search.max_radius } else { radius };
+            Some(Prediction { descriptor: point.descriptor, pixel, radius })
+        };
+        let (points, predictions): (Vec<_>, Vec<_>) = ids
+            .iter()
+            .filter_map(|id| self.map.get(*id))
+            .filter_map(|point| Some((point, predict(point)?)))
+            .unzip();
+        let associate = |m: Match| {
+            let (point, prediction) = (points.get(m.query)?, predictions.get(m.query)?);
+            let (_, measurement) = features.measured.get(m.train)?;
+            Some(Association {
+                feature: m.train,
+                point: point.id,
+                predicted: prediction.pixel,
+                correspondence: Correspondence {
+                    measurement: *measurement,
+                    world: point.position,
+                    world_covariance: point.covariance,
+                },
+            })
+        };
+        let matches = match_guided(&predictions, &features.seen, &view.config.matching);
+        matches.into_iter().filter_map(associate).collect()
+    }
+
+    /// Indices into `matches` that agree on one pose.
+    fn find_inliers(
+        &self,
+        features: &Features,
+        matches: &[Association],
+        view: &View,
+    ) -> Vec<usize> {
+        debug_assert!(matches.iter().all(|m| m.feature < features.seen.len()));
+        let correspondences: Vec<_> = matches.iter().map(|m| m.correspondence).collect();
+        let rotation = self.world_from_camera(view).rotation;
+        let config = &view.config.ransac;
+        estimate_pose(&correspondences, view.camera, Some(&rotation), config, view.seed)
+            .map(|agreement| agreement.inliers)
+            .unwrap_or_default()
+    }
+
+    /// Conditions belief and map on the inliers; the normalised innovation if there were any.
+    fn update(
+        &mut self,
+        matches: &[Association],
+        inliers: &[usize],
+        treatment: MapTreatment,
+        view: &View,
+    ) -> Option<f64> {
+        let pairs: Vec<_> = inliers
+            .iter()
+            .filter_map(|&i| matches.get(i))
+            .map(|m| (m.point, point_pair(&m.correspondence, view)))
+            .collect();
+        let only_pairs: Vec<_> = pairs.iter().map(|(_, pair)| *pair).collect();
+        let outcome = self.filter.update(&only_pairs)?;
+        if treatment == MapTreatment::Uncertain {
+            for (id, pair) in &pairs {
+                if let Some(refined) = self.filter.refine(pair) {
+                    self.map.relocate(*id, refined.position, refined.covariance);
+                }
+            }
+        }
+        Some(outcome.innovation)
+    }
+
+    /// Renews the points seen, inserts new ones, forgets old ones. What became of each feature,
+    /// and where it was predicted, comes back in the order of `features.all`.
+    fn grow_map(
+        &mut self,
+        number: u64,
+        features: &Features,
+        matches: &[Association],
+        inliers: &[usize],
+        treatment: MapTreatment,
+        view: &View,
+    ) -> Vec<(KeypointRole, Option<Point2<f64>>)> {
+        let camera = self.world_from_camera(view).translation.vector;
+        let sighting =
+            |feature: &Feature| Sighting { frame: number, camera, descriptor: feature.descriptor };
+        let mut roles = vec![(KeypointRole::NoDepth, None); features.all.len()];
+        for (index, _) in &features.measured {
+            roles[*index].0 = KeypointRole::Unmatched;
+        }
+        for (m, accepted) in matches.iter().zip(membership(inliers, matches.len())) {
+            let (index, _) = features.measured[m.feature];
+            let role = if accepted { KeypointRole::Inlier } else { KeypointRole::Outlier };
+            roles[index] = (role, Some(m.predicted));
+            if accepted {
+                self.map.observe(m.point, &sighting(&features.all[index]));
+            }
+        }
+        for (index, measurement) in &features.measured {
+            if roles[*index].0 == KeypointRole::Unmatched {
+                let (in_body, covariance) = in_body(measurement, view);
+                let estimate = self.filter.insert(treatment, &in_body, &covariance);
+                let sighting = sighting(&features.all[*index]);
+                let inserted =
+                    self.map.insert(estimate.position, estimate.covariance, &sighting).is_some();
+                if inserted {
+                    roles[*index].0 = KeypointRole::New;
+                }
+            }
+        }
+        self.map.prune(number);
+        roles
+    }
+}
+
+/// A camera measurement in body coordinates, its covariance inflated as configured.
+fn in_body(measurement: &PointMeasurement, view: &View) -> (Vector3<f64>, Matrix3<f64>) {
+    let rotation = view.body_from_camera.rotation.to_rotation_matrix();
+    let covariance = rotation.matrix() * measurement.covariance * rotation.matrix().transpose();
+    let point = (view.body_from_camera * Point3::from(measurement.point)).coords;
+    (point, covariance * view.config.filter.measurement_inflation)
+}
+
+fn point_pair(correspondence: &Correspondence, view: &View) -> PointPair {
+    let (in_body, body_covariance) = in_body(&correspondence.measurement, view);
+    PointPair {
+        in_body,
+        body_covariance,
+        in_world: correspondence.world,
+        world_covariance: correspondence.world_covariance,
+    }
+}
+
+/// For each of `count` items whether its index is in the ascending list `chosen`.
+fn membership(chosen: &[usize], count: usize) -> impl Iterator<Item = bool> + '_ {
+    (0..count).map(|i| chosen.binary_search(&i).is_ok())
+}
+
+/// The sample at `stamp` on the line between two samples.
+fn interpolate(from: &ImuSample, to: &ImuSample, stamp: Stamp) -> ImuSample {
+    let interval = to.stamp.seconds_since(from.stamp);
+    let fraction = if interval > 0.0 { stamp.seconds_since(from.stamp) / interval } else { 1.0 };
+    ImuSample {
+        stamp,
+        angular_velocity: from.angular_velocity.lerp(&to.angular_velocity, fraction),
+        specific_force: from.specific_force.lerp(&to.specific_force, fraction),
+    }
+}
+
+fn keypoint_views(
+    features: &[Feature],
+    roles: &[(KeypointRole, Option<Point2<f64>>)],
+) -> Vec<KeypointView> {
+    let pixel = |p: &Point2<f64>| [p.x as f32, p.y as f32];
+    features
+        .iter()
+        .zip(roles)
+        .map(|(feature, (role, predicted))| KeypointView {
+            pixel: pixel(&feature.pixel),
+            predicted: predicted.as_ref().map(pixel),
+            role: *role,
+        })
+        .collect()
+}
+
+fn map_views(map: &Map, frame: u64) -> Vec<MapPointView> {
+    let view = |point: &MapPoint| MapPointView {
+        position: [point.position.x as f32, point.position.y as f32, point.position.z as f32],
+        sigma: (point.covariance.trace().max(0.0) / 3.0).sqrt() as f32,
+        age: frame.saturating_sub(point.first_seen).try_into().unwrap_or(u32::MAX),
+    };
+    map.points().iter().map(view).collect()
+}
+
+/// Attitude of a camera that looks along the world's x axis with its rows horizontal.
+fn camera_looking_ahead() -> UnitQuaternion<f64> {
+    let world_from_camera = Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]);
+    UnitQuaternion::from_matrix(&world_from_camera)
+}
+
+/// Laps of wall time between the stages of a frame.
+struct StageClock(Instant);
+
+impl StageClock {
+    fn start() -> Self {
+        Self(Instant::now())
+    }
+
+    /// Seconds since the last lap.
+    fn lap(&mut self) -> f64 {
+        let now = Instant::now();
+        let seconds = (now - self.0).as_secs_f64();
+        self.0 = now;
+        seconds
+    }
+}

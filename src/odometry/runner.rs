@@ -1,0 +1,144 @@
+//! Drives a log through front end and pipeline, on one thread or on several.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread;
+use std::time::Instant;
+
+use super::{Event, FrontEndFrame, Odometry, StepReport};
+use crate::inertial::Stamp;
+use crate::vision::{Feature, RgbdFrame};
+
+/// Finds the features of one frame; holds no state that one frame hands to the next.
+pub trait FrontEnd: Send {
+    /// A message that says why a frame has no features.
+    fn features(&mut self, frame: &RgbdFrame) -> Result<Vec<Feature>, String>;
+}
+
+#[cfg(feature = "vision")]
+impl FrontEnd for crate::vision::OrbExtractor {
+    fn features(&mut self, frame: &RgbdFrame) -> Result<Vec<Feature>, String> {
+        self.extract(frame).map_err(|error| error.to_string())
+    }
+}
+
+/// How a run is driven.
+#[derive(Debug, Clone, Copy)]
+pub struct RunOptions<'a> {
+    /// 1: everything in turn on the calling thread; more: reading, features and estimation
+    /// overlap. The results are the same.
+    pub threads: usize,
+    /// Part of the log that is used, s after its first event and length.
+    pub start: f64,
+    pub duration: f64,
+    /// Ends the run early, with what is there, once it is true.
+    pub stop: &'a AtomicBool,
+}
+
+/// Frames and samples that may wait between two threads.
+const QUEUE: usize = 16;
+
+/// An event after the front end.
+enum Prepared {
+    Other(Event),
+    Frame(FrontEndFrame),
+}
+
+/// Runs all of `events` through `odometry`, which is given back each report with its frame.
+pub fn run(
+    events: impl Iterator<Item = Event> + Send,
+    front_end: &mut dyn FrontEnd,
+    odometry: &mut Odometry,
+    options: RunOptions,
+    mut observe: impl FnMut(StepReport, &RgbdFrame, &Odometry),
+) {
+    let events = Clipped { events, options, first: None };
+    let mut feed = |prepared: Prepared| {
+        match prepared {
+            Prepared::Other(Event::Imu(sample)) => odometry.push_imu(sample),
+            Prepared::Other(Event::Truth(pose)) => odometry.push_truth(pose),
+            Prepared::Other(Event::Frame(_)) => {}
+            Prepared::Frame(frame) => odometry.push_frame(frame),
+        }
+        while let Some((report, frame)) = odometry.step() {
+            observe(report, &frame, odometry);
+        }
+    };
+    if options.threads <= 1 {
+        events.map(|event| prepare(event, front_end)).for_each(&mut feed);
+    } else {
+        thread::scope(|scope| {
+            let (to_features, read) = sync_channel(QUEUE);
+            let (to_estimator, prepared) = sync_channel(QUEUE);
+            scope.spawn(move || send_all(events, &to_features));
+            scope.spawn(move || prepare_all(&read, front_end, &to_estimator));
+            prepared.iter().for_each(&mut feed);
+        });
+    }
+    odometry.end();
+    while let Some((report, frame)) = odometry.step() {
+        observe(report, &frame, odometry);
+    }
+}
+
+fn send_all(events: impl Iterator<Item = Event>, to: &SyncSender<Event>) {
+    for event in events {
+        if to.send(event).is_err() {
+            break;
+        }
+    }
+}
+
+fn prepare_all(from: &Receiver<Event>, front_end: &mut dyn FrontEnd, to: &SyncSender<Prepared>) {
+    for event in from {
+        if to.send(prepare(event, front_end)).is_err() {
+            break;
+        }
+    }
+}
+
+fn prepare(event: Event, front_end: &mut dyn FrontEnd) -> Prepared {
+    match event {
+        Event::Frame(frame) => {
+            let start = Instant::now();
+            let features = front_end.features(&frame).unwrap_or_else(|reason| {
+                tracing::warn!("frame at {} s: {reason}", frame.stamp);
+                Vec::new()
+            });
+            Prepared::Frame(FrontEndFrame {
+                frame,
+                features,
+                seconds: start.elapsed().as_secs_f64(),
+            })
+        }
+        other => Prepared::Other(other),
+    }
+}
+
+/// The part of a log between `start` and `start + duration`, until the stop flag is raised.
+struct Clipped<'a, I> {
+    events: I,
+    options: RunOptions<'a>,
+    first: Option<Stamp>,
+}
+
+impl<I: Iterator<Item = Event>> Iterator for Clipped<'_, I> {
+    type Item = Event;
+
+    fn next(&mut self) -> Option<Event> {
+        loop {
+            if self.options.stop.load(Ordering::Relaxed) {
+                return None;
+            }
+            let event = self.events.next()?;
+            let stamp = event.stamp();
+            let time = stamp.seconds_since(*self.first.get_or_insert(stamp));
+            if time > self.options.start + self.options.duration {
+                return None;
+            }
+            if time >= self.options.start {
+                return Some(event);
+            }
+        }
+    }
+}
