@@ -1,44 +1,10 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use nalgebra::Isometry3;
 use serde::{Deserialize, Serialize};
 
-use crate::inertial::{ImuSample, Stamp};
-use crate::vision::{ColorImage, DepthImage};
-
-/// A color image and the depth image registered to it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RgbdFrame {
-    /// Header stamp of the color image.
-    pub stamp: Stamp,
-    pub color: ColorImage,
-    pub depth: DepthImage,
-}
-
-/// A pose from motion capture or another reference, as logged: its world need not be z-up.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TruthPose {
-    pub stamp: Stamp,
-    pub world_from_body: Isometry3<f64>,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-pub enum Event {
-    Imu(ImuSample),
-    Frame(Box<RgbdFrame>),
-    Truth(TruthPose),
-}
-
-impl Event {
-    pub fn stamp(&self) -> Stamp {
-        match self {
-            Self::Imu(sample) => sample.stamp,
-            Self::Frame(frame) => frame.stamp,
-            Self::Truth(pose) => pose.stamp,
-        }
-    }
-}
+pub use crate::odometry::{Event, TruthPose};
+pub use crate::vision::RgbdFrame;
 
 /// What a reader met: counts that end up in `metrics.json`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -92,9 +58,9 @@ pub trait Log: Send {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LogConfig {
-    /// Topic of the color image; empty: chosen by message type.
+    /// Topic of the color image; empty: chosen by message type; `"none"`: not used.
     pub color_topic: String,
-    /// Topic of the depth image; empty: chosen by message type and encoding.
+    /// Topic of the depth image; empty: chosen by message type and encoding; `"none"`: not used.
     pub depth_topic: String,
     /// Topic of the IMU; empty: chosen by message type; `"none"`: not used.
     pub imu_topic: String,
@@ -128,6 +94,30 @@ impl Default for LogConfig {
     }
 }
 
+impl LogConfig {
+    /// # Errors
+    /// [`LogError::Config`] for a value without meaning.
+    pub fn validate(&self) -> Result<(), LogError> {
+        let error = |key, value: String, expected| Err(LogError::Config { key, value, expected });
+        if !["bgr", "rgb"].contains(&self.color_8uc3.as_str()) {
+            return error("color_8uc3", self.color_8uc3.clone(), "\"bgr\" or \"rgb\"");
+        }
+        if !(self.depth_scale as f32 > 0.0 && self.depth_scale.is_finite()) {
+            return error("depth_scale", self.depth_scale.to_string(), "a positive number");
+        }
+        let times = [
+            ("max_pair_difference", self.max_pair_difference),
+            ("reorder_window", self.reorder_window),
+        ];
+        for (key, value) in times {
+            if !(value >= 0.0 && value.is_finite()) {
+                return error(key, value.to_string(), "seconds, not negative");
+            }
+        }
+        Ok(())
+    }
+}
+
 /// A log that cannot be read at all.
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
@@ -141,4 +131,6 @@ pub enum LogError {
     Corrupt { path: PathBuf, reason: String },
     #[error("{path}: no {role} in this log; it has: {available}")]
     MissingStream { path: PathBuf, role: &'static str, available: String },
+    #[error("log.{key} = {value}: expected {expected}")]
+    Config { key: &'static str, value: String, expected: &'static str },
 }

@@ -1,5 +1,26 @@
 //! Logs in and out. Every reader yields the same time-ordered [`Event`]s behind [`Log`].
+//!
+//! [`open`] guesses the format. Containers ([`bag`], [`mcap_file`]) yield messages, [`ros`] makes
+//! readings of them, folders ([`tum`], [`seven_scenes`]) yield readings directly, and [`merge`]
+//! orders and pairs the readings. A log that is cut or damaged yields all that can still be read.
 
+mod bag;
 mod event;
+mod folder;
+mod mcap_file;
+mod merge;
+mod message;
+mod open;
+mod pair;
+mod pixels;
+mod ros;
+#[cfg(test)]
+mod samples;
+mod section;
+mod seven_scenes;
+mod tum;
+mod write;
 
 pub use event::{Event, Log, LogConfig, LogError, LogSummary, ReadReport, RgbdFrame, TruthPose};
+pub use open::{detect, open};
+pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

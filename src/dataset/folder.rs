@@ -1,0 +1,112 @@
+//! Logs that are folders of image files, with stamps and poses in text.
+
+use std::path::{Path, PathBuf};
+
+use super::merge::{Reading, ReadingSource};
+use super::pair::{Paired, Pairer};
+use super::pixels::{Rejection, compressed_color, compressed_depth};
+use super::{LogConfig, LogError, ReadReport, TruthPose};
+use crate::inertial::Stamp;
+
+/// Files larger than this are not images of a log, bytes.
+const LARGEST_FILE: u64 = 256 << 20;
+
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Entry {
+    Color(PathBuf),
+    Depth(PathBuf),
+    Truth(TruthPose),
+}
+
+/// What a folder contains, and what of it could not be used.
+#[derive(Debug, Default)]
+pub(super) struct Listing {
+    pub entries: Vec<(Stamp, Entry)>,
+    /// Reason and detail of each line or file left out.
+    pub rejections: Vec<(String, String)>,
+}
+
+impl Listing {
+    pub fn has_truth(&self) -> bool {
+        self.entries.iter().any(|(_, entry)| matches!(entry, Entry::Truth(_)))
+    }
+
+    /// Number of color and depth pairs.
+    pub fn frames(&self, config: &LogConfig) -> u64 {
+        let mut pairer = Pairer::new((config.max_pair_difference * 1e9).round() as i64);
+        for (stamp, entry) in &self.entries {
+            match entry {
+                Entry::Color(_) => pairer.add_color(*stamp, ()),
+                Entry::Depth(_) => pairer.add_depth(*stamp, ()),
+                Entry::Truth(_) => false,
+            };
+        }
+        let mut frames = 0;
+        pairer.settle(Stamp::from_nanos(i64::MAX), |paired| {
+            frames += u64::from(matches!(paired, Paired::Pair(..)));
+        });
+        frames
+    }
+}
+
+/// Reads the image files one by one, in order of their stamps.
+pub(super) struct FolderSource {
+    entries: std::vec::IntoIter<(Stamp, Entry)>,
+    rejections: Vec<(String, String)>,
+    config: LogConfig,
+}
+
+impl FolderSource {
+    pub fn new(mut listing: Listing, config: &LogConfig) -> Self {
+        listing.entries.sort_by_key(|(stamp, _)| *stamp);
+        Self {
+            entries: listing.entries.into_iter(),
+            rejections: listing.rejections,
+            config: config.clone(),
+        }
+    }
+}
+
+impl ReadingSource for FolderSource {
+    fn next_reading(&mut self, report: &mut ReadReport) -> Option<Reading> {
+        for (reason, detail) in self.rejections.drain(..) {
+            report.skip(&reason, detail);
+        }
+        for (stamp, entry) in self.entries.by_ref() {
+            let (role, path, reading) = match entry {
+                Entry::Truth(pose) => return Some(Reading::Truth(pose)),
+                Entry::Color(path) => {
+                    let image = read_file(&path).and_then(|bytes| compressed_color(&bytes));
+                    ("color image", path, image.map(|image| Reading::Color(stamp, image)))
+                }
+                Entry::Depth(path) => {
+                    let image =
+                        read_file(&path).and_then(|bytes| compressed_depth(&bytes, &self.config));
+                    ("depth image", path, image.map(|image| Reading::Depth(stamp, image)))
+                }
+            };
+            match reading {
+                Ok(reading) => return Some(reading),
+                Err(Rejection { reason, detail }) => report.skip(
+                    &format!("{role}: {reason}"),
+                    format_args!("{}: {detail}", path.display()),
+                ),
+            }
+        }
+        None
+    }
+}
+
+fn read_file(path: &Path) -> Result<Vec<u8>, Rejection> {
+    let unreadable = |error: std::io::Error| Rejection::new("cannot be read", error.to_string());
+    let size = std::fs::metadata(path).map_err(unreadable)?.len();
+    if size > LARGEST_FILE {
+        return Err(Rejection::new("absurd size", format!("{size} bytes")));
+    }
+    std::fs::read(path).map_err(unreadable)
+}
+
+pub(super) fn read_text(path: &Path) -> Result<String, LogError> {
+    std::fs::read_to_string(path)
+        .map_err(|source| LogError::Io { path: path.to_path_buf(), source })
+}

@@ -1,0 +1,394 @@
+//! ROS logs, whatever their container: which topic plays which role, and messages to readings.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::merge::{Reading, ReadingSource};
+use super::message::{self, Fields, MessageType, Serialization};
+use super::pixels::{
+    Rejection, color_format, compressed_color, compressed_depth, is_depth_encoding, raw_color,
+    raw_depth,
+};
+use super::{LogConfig, LogError, LogSummary, ReadReport};
+use crate::inertial::ImuConfig;
+use crate::vision::PixelFormat;
+
+/// A connection of a bag or a channel of an MCAP file.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Channel {
+    pub topic: String,
+    /// Name of the message type, as logged.
+    pub schema: String,
+    /// `None` for a type or serialization that is not read.
+    pub kind: Option<(MessageType, Serialization)>,
+}
+
+/// Takes a message: its channel and its serialised content.
+pub(super) type Visitor<'a> = dyn FnMut(&Channel, &[u8], &mut ReadReport) + 'a;
+
+/// The messages of a log in the order in which they were logged.
+pub(super) trait MessageSource: Send {
+    /// Channels met so far, or all where [`Self::is_indexed`].
+    fn channels(&self) -> Vec<&Channel>;
+
+    /// Whether the log's index listed its channels when it was opened.
+    fn is_indexed(&self) -> bool;
+
+    /// Passes over messages of other topics from now on.
+    fn only(&mut self, topics: Vec<String>);
+
+    /// Hands the next message to `visitor`; `false` at the end of what can be read.
+    fn visit_next(&mut self, report: &mut ReadReport, visitor: &mut Visitor) -> bool;
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Role {
+    Color,
+    Depth,
+    Imu,
+    Truth,
+}
+
+impl Role {
+    const ALL: [Self; 4] = [Self::Color, Self::Depth, Self::Imu, Self::Truth];
+
+    /// Its key in [`LogSummary::sources`].
+    fn key(self) -> &'static str {
+        match self {
+            Self::Color => "color",
+            Self::Depth => "depth",
+            Self::Imu => "imu",
+            Self::Truth => "truth",
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Color => "color image",
+            Self::Depth => "depth image",
+            Self::Imu => "imu",
+            Self::Truth => "truth",
+        }
+    }
+
+    fn configured(self, config: &LogConfig) -> &str {
+        match self {
+            Self::Color => &config.color_topic,
+            Self::Depth => &config.depth_topic,
+            Self::Imu => &config.imu_topic,
+            Self::Truth => &config.truth_topic,
+        }
+    }
+
+    fn takes(self, kind: MessageType) -> bool {
+        use MessageType::*;
+        match self {
+            Self::Color | Self::Depth => matches!(kind, Image | CompressedImage),
+            Self::Imu => kind == Imu,
+            Self::Truth => matches!(kind, PoseStamped | TransformStamped | Odometry),
+        }
+    }
+}
+
+/// How many messages, and bytes of them, are looked at before the topics are chosen.
+const SURVEY_MESSAGES: usize = 10_000;
+const SURVEY_BYTES: usize = 64 << 20;
+
+/// IMU samples looked at to tell g from m/s^2.
+const SURVEY_IMU_SAMPLES: usize = 50;
+
+/// Median specific force below this is taken for g, above for m/s^2.
+const LARGEST_MEDIAN_IN_G: f64 = 4.0;
+
+/// What the first messages tell of a topic.
+#[derive(Debug, Clone)]
+struct Topic {
+    schema: String,
+    kind: Option<MessageType>,
+    /// Of the first image, and its width and height where they are known.
+    encoding: Option<String>,
+    size: Option<(u32, u32)>,
+    /// Norms of the first accelerometer readings, as logged.
+    accelerations: Vec<f64>,
+}
+
+impl Topic {
+    fn new(channel: &Channel) -> Self {
+        Self {
+            schema: channel.schema.clone(),
+            kind: channel.kind.map(|(kind, _)| kind),
+            encoding: None,
+            size: None,
+            accelerations: Vec::new(),
+        }
+    }
+
+    fn is_image(&self) -> bool {
+        matches!(self.kind, Some(MessageType::Image | MessageType::CompressedImage))
+    }
+
+    fn observe(&mut self, channel: &Channel, data: &[u8]) -> Result<(), Rejection> {
+        let Some((kind, serialization)) = channel.kind else { return Ok(()) };
+        let fields = Fields::new(data, serialization)?;
+        match kind {
+            MessageType::Image if self.encoding.is_none() => {
+                let (_, image) = message::image(fields)?;
+                self.encoding = Some(image.encoding.to_owned());
+                self.size = Some((image.width, image.height));
+            }
+            MessageType::CompressedImage if self.encoding.is_none() => {
+                self.encoding = Some(message::compressed_image(fields)?.format.to_owned());
+            }
+            MessageType::Imu if self.accelerations.len() < SURVEY_IMU_SAMPLES => {
+                let sample = message::imu(fields, &ImuConfig::default())?;
+                self.accelerations.push(sample.specific_force.norm());
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// How well it suits `role`, smaller being better; `None` if not at all.
+    fn rank(&self, name: &str, role: Role, color_size: Option<(u32, u32)>) -> Option<u32> {
+        let kind = self.kind.filter(|kind| role.takes(*kind))?;
+        let encoding = self.encoding.as_deref();
+        match role {
+            Role::Color if kind == MessageType::Image => {
+                color_format(encoding?, &LogConfig::default())
+                    .map(|format| if format == PixelFormat::Mono8 { 2 } else { 0 })
+            }
+            Role::Color => match encoding? {
+                format if message::is_depth_format(format) => None,
+                format => Some(if format.contains("mono8") { 3 } else { 1 }),
+            },
+            Role::Depth if kind == MessageType::Image => {
+                is_depth_encoding(encoding?).then_some(u32::from(self.size != color_size))
+            }
+            Role::Depth => message::is_depth_format(encoding?).then_some(2),
+            Role::Imu => Some(u32::from(self.accelerations.is_empty())),
+            Role::Truth => match kind {
+                MessageType::PoseStamped => Some(0),
+                MessageType::TransformStamped => Some(1),
+                // Most odometry topics are estimates, not a reference.
+                _ => ["truth", "gt", "mocap", "vicon"]
+                    .iter()
+                    .any(|word| name.contains(word))
+                    .then_some(2),
+            },
+        }
+    }
+
+    fn logs_g(&self) -> bool {
+        let mut norms = self.accelerations.clone();
+        norms.sort_by(f64::total_cmp);
+        norms.get(norms.len() / 2).is_some_and(|median| *median < LARGEST_MEDIAN_IN_G)
+    }
+}
+
+/// The topics of a log, by name.
+#[derive(Debug, Clone)]
+pub(super) struct Survey {
+    topics: BTreeMap<String, Topic>,
+}
+
+impl Survey {
+    /// Reads the first messages; `messages` is to be opened anew afterwards.
+    pub fn new(messages: &mut dyn MessageSource) -> Self {
+        let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
+        let (mut count, mut bytes) = (0, 0);
+        for channel in messages.channels() {
+            topics.entry(channel.topic.clone()).or_insert_with(|| Topic::new(channel));
+        }
+        // Faults are reported when the log is read in earnest.
+        let mut unreported = ReadReport::default();
+        while count < SURVEY_MESSAGES && bytes < SURVEY_BYTES {
+            let more = messages.visit_next(&mut unreported, &mut |channel, data, _| {
+                let topic =
+                    topics.entry(channel.topic.clone()).or_insert_with(|| Topic::new(channel));
+                let _ = topic.observe(channel, data);
+                count += 1;
+                bytes += data.len();
+            });
+            let known = |topic: &Topic| {
+                (!topic.is_image() || topic.encoding.is_some())
+                    && (topic.kind != Some(MessageType::Imu)
+                        || topic.accelerations.len() == SURVEY_IMU_SAMPLES)
+            };
+            if !more || messages.is_indexed() && topics.values().all(known) {
+                break;
+            }
+        }
+        Self { topics }
+    }
+
+    /// Topics with their types and encodings, for messages to the user.
+    fn describe(&self) -> String {
+        let describe = |(name, topic): (&String, &Topic)| match &topic.encoding {
+            Some(encoding) => format!("{name} ({} {encoding})", topic.schema),
+            None => format!("{name} ({})", topic.schema),
+        };
+        let topics: Vec<_> = self.topics.iter().map(describe).collect();
+        if topics.is_empty() { "no topics".to_owned() } else { topics.join(", ") }
+    }
+
+    fn best(&self, role: Role, color_size: Option<(u32, u32)>) -> Option<&String> {
+        let ranked = self.topics.iter().filter_map(|(name, topic)| {
+            topic.rank(name, role, color_size).map(|rank| (rank, name))
+        });
+        ranked.min().map(|(_, name)| name)
+    }
+
+    fn config_name(&self) -> &'static str {
+        let is = |name: &str, role: Role| {
+            let topic = self.topics.get(name);
+            topic.is_some_and(|topic| topic.kind.is_some_and(|kind| role.takes(kind)))
+        };
+        let layout = is("/cam0/color", Role::Color)
+            && is("/cam0/depth", Role::Depth)
+            && is("/imu", Role::Imu);
+        // The same topics may come from a log that was converted to SI units.
+        let in_g = self.topics.get("/imu").is_some_and(Topic::logs_g);
+        if layout && in_g { "vcu_rvi" } else { "sim" }
+    }
+
+    /// Chooses a topic for each role; `Err` names the first that is configured but not there.
+    fn choose(&self, config: &LogConfig) -> Result<BTreeMap<Role, String>, Role> {
+        let mut chosen = BTreeMap::new();
+        let mut color_size = None;
+        for role in Role::ALL {
+            let name = match role.configured(config) {
+                "none" => None,
+                "" => self.best(role, color_size),
+                wanted => match self.topics.get_key_value(wanted) {
+                    Some((name, topic)) if topic.kind.is_some_and(|kind| role.takes(kind)) => {
+                        Some(name)
+                    }
+                    _ => return Err(role),
+                },
+            };
+            if let Some(name) = name {
+                if role == Role::Color {
+                    color_size = self.topics.get(name).and_then(|topic| topic.size);
+                }
+                chosen.insert(role, name.clone());
+            }
+        }
+        Ok(chosen)
+    }
+
+    /// Without the demand that the log be complete.
+    pub fn summary(&self, kind: &str) -> LogSummary {
+        let chosen = self.choose(&LogConfig::default()).unwrap_or_default();
+        self.summary_of(kind, &chosen)
+    }
+
+    fn summary_of(&self, kind: &str, chosen: &BTreeMap<Role, String>) -> LogSummary {
+        LogSummary {
+            kind: kind.to_owned(),
+            config_name: self.config_name().to_owned(),
+            has_imu: chosen.contains_key(&Role::Imu),
+            has_truth: chosen.contains_key(&Role::Truth),
+            sources: chosen
+                .iter()
+                .map(|(role, name)| (role.key().to_owned(), name.clone()))
+                .collect(),
+            frames: None,
+        }
+    }
+}
+
+/// Decodes the messages of the chosen topics.
+pub(super) struct RosSource<M> {
+    messages: M,
+    roles: BTreeMap<String, Role>,
+    log: LogConfig,
+    imu: ImuConfig,
+}
+
+impl<M: MessageSource> RosSource<M> {
+    /// `messages` from the start; `path` and `kind` for errors and the summary.
+    pub fn new(
+        mut messages: M,
+        survey: &Survey,
+        (path, kind): (&Path, &str),
+        log: &LogConfig,
+        imu: &ImuConfig,
+    ) -> Result<(Self, LogSummary), LogError> {
+        let missing = |role: Role| LogError::MissingStream {
+            path: path.to_path_buf(),
+            role: role.name(),
+            available: survey.describe(),
+        };
+        let chosen = survey.choose(log).map_err(missing)?;
+        for role in [Role::Color, Role::Depth] {
+            if role.configured(log) != "none" && !chosen.contains_key(&role) {
+                return Err(missing(role));
+            }
+        }
+        for (role, topic) in &chosen {
+            if role.configured(log).is_empty() {
+                tracing::info!("{}: {topic} (chosen by message type)", role.name());
+            }
+        }
+        messages.only(chosen.values().cloned().collect());
+        let summary = survey.summary_of(kind, &chosen);
+        let roles = chosen.into_iter().map(|(role, topic)| (topic, role)).collect();
+        Ok((Self { messages, roles, log: log.clone(), imu: imu.clone() }, summary))
+    }
+}
+
+impl<M: MessageSource> ReadingSource for RosSource<M> {
+    fn next_reading(&mut self, report: &mut ReadReport) -> Option<Reading> {
+        let Self { messages, roles, log, imu } = self;
+        loop {
+            let mut reading = None;
+            let more = messages.visit_next(report, &mut |channel, data, report| {
+                let Some(role) = roles.get(&channel.topic) else { return };
+                match decode(*role, channel, data, log, imu) {
+                    Ok(decoded) => reading = Some(decoded),
+                    Err(Rejection { reason, detail }) => report.skip(
+                        &format!("{}: {reason}", role.name()),
+                        format_args!("{}: {detail}", channel.topic),
+                    ),
+                }
+            });
+            if reading.is_some() || !more {
+                return reading;
+            }
+        }
+    }
+}
+
+fn decode(
+    role: Role,
+    channel: &Channel,
+    data: &[u8],
+    log: &LogConfig,
+    imu: &ImuConfig,
+) -> Result<Reading, Rejection> {
+    let Some((kind, serialization)) = channel.kind.filter(|(kind, _)| role.takes(*kind)) else {
+        return Err(Rejection::new("unexpected message type", &channel.schema));
+    };
+    let fields = Fields::new(data, serialization)?;
+    match (role, kind) {
+        (Role::Imu, _) => message::imu(fields, imu).map(Reading::Imu),
+        (Role::Truth, _) => message::pose(fields, kind).map(Reading::Truth),
+        (Role::Color, MessageType::Image) => {
+            let (stamp, raw) = message::image(fields)?;
+            raw_color(&raw, log).map(|image| Reading::Color(stamp, image))
+        }
+        (Role::Color, _) => {
+            let image = message::compressed_image(fields)?;
+            compressed_color(image.data).map(|color| Reading::Color(image.stamp, color))
+        }
+        (Role::Depth, MessageType::Image) => {
+            let (stamp, raw) = message::image(fields)?;
+            raw_depth(&raw, log).map(|image| Reading::Depth(stamp, image))
+        }
+        (Role::Depth, _) => {
+            let image = message::compressed_image(fields)?;
+            compressed_depth(image.depth_file()?, log)
+                .map(|depth| Reading::Depth(image.stamp, depth))
+        }
+    }
+}
