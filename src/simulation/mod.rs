@@ -1,1 +1,19 @@
 //! Worlds, motions and sensors.
+
+mod config;
+mod inertial;
+mod motion;
+mod render;
+mod sensors;
+mod spline;
+mod texture;
+mod trajectory;
+mod world;
+
+pub use config::{ImuSensorConfig, LightConfig, SceneConfig, SceneError, TruthConfig};
+pub use inertial::ImuSimulator;
+pub use motion::{BodyState, Motion, MotionConfig, MotionKind};
+pub use render::{DropoutConfig, ImageConfig, Renderer, Shot};
+pub use sensors::Simulation;
+pub use trajectory::{Carrier, TrajectoryConfig, TrajectoryError};
+pub use world::{PeopleConfig, RoomConfig, World};

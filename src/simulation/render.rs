@@ -1,0 +1,508 @@
+//! The RGB-D camera: rays through the world, then optics, noise and quantization.
+
+use nalgebra::{Isometry3, Vector3};
+use rand::RngCore;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use statrs::function::erf::erf_inv;
+
+use super::world::{Solid, View, World};
+use crate::vision::{ColorImage, DepthConfig, DepthImage, PinholeCamera, PixelFormat};
+
+/// The color image.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ImageConfig {
+    /// Width of the images, pixels.
+    pub width: usize,
+    /// Height of the images, pixels.
+    pub height: usize,
+    /// Frames per second.
+    pub rate: f64,
+    /// Factor on the light that reaches the sensor.
+    pub exposure: f64,
+    /// Standard deviation of the noise of each channel at exposure 1, in steps of 1/255. The
+    /// response is a square root, so photon noise is the same in light and shadow.
+    pub noise: f64,
+    /// Light lost in the corners of the image, as a fraction.
+    pub vignetting: f64,
+    /// Time over which the shutter is open, centred on the stamp, s; blurs what moves.
+    pub shutter: f64,
+}
+
+impl Default for ImageConfig {
+    fn default() -> Self {
+        Self {
+            width: 640,
+            height: 480,
+            rate: 30.0,
+            exposure: 1.0,
+            noise: 2.0,
+            vignetting: 0.2,
+            shutter: 0.004,
+        }
+    }
+}
+
+/// Where the depth sensor returns nothing, besides its range.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DropoutConfig {
+    /// Fraction of all pixels.
+    pub anywhere: f64,
+    /// Fraction of the pixels at edges (`depth.edge_fraction`).
+    pub edges: f64,
+    /// Surfaces seen at a cosine of incidence below this return nothing.
+    pub grazing_cosine: f64,
+}
+
+impl Default for DropoutConfig {
+    fn default() -> Self {
+        Self { anywhere: 0.01, edges: 0.8, grazing_cosine: 0.1 }
+    }
+}
+
+/// Where the camera is when the shutter opens, and how it moves.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Shot {
+    pub world_from_camera: Isometry3<f64>,
+    /// Camera coordinates, m/s.
+    pub velocity: Vector3<f64>,
+    /// Camera coordinates, rad/s.
+    pub angular_velocity: Vector3<f64>,
+    /// Seconds from the start; places what moves.
+    pub time: f64,
+    /// Factor on the light in the room.
+    pub light: f64,
+    /// Number of the frame; sets the noise.
+    pub frame: u64,
+}
+
+/// Nothing nearer to the camera is seen, m.
+const NEAR: f32 = 0.05;
+/// Rows of a band (one task) and columns of a tile (one list of candidates).
+const BAND: usize = 16;
+const TILE: usize = 32;
+
+/// What one ray met.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sample {
+    color: [f32; 3],
+    /// Along the optical axis, m.
+    depth: f32,
+    /// Identifies box and face.
+    surface: u32,
+    /// Cosine of incidence.
+    cosine: f32,
+}
+
+/// The world as seen from one pose.
+struct Scene<'a> {
+    world: &'a World,
+    views: Vec<View>,
+    /// Smallest rectangle of pixels that contains each box: left, top, right, bottom.
+    bounds: Vec<[f32; 4]>,
+    camera: Lens,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Lens {
+    center: [f32; 2],
+    /// Size of a pixel in normalized image coordinates.
+    pixel: [f32; 2],
+}
+
+impl Lens {
+    fn direction(&self, column: f32, row: f32) -> (f32, f32) {
+        ((column - self.center[0]) * self.pixel[0], (row - self.center[1]) * self.pixel[1])
+    }
+}
+
+impl Scene<'_> {
+    fn trace(&self, column: f32, row: f32, candidates: &[usize]) -> Sample {
+        let (x, y) = self.camera.direction(column, row);
+        let mut nearest: Option<(usize, super::world::Hit)> = None;
+        for &index in candidates {
+            let hit = self.world.solids[index].hit_in_view(&self.views[index], x, y, NEAR);
+            if let Some(hit) = hit.filter(|h| nearest.is_none_or(|(_, n)| h.distance < n.distance))
+            {
+                nearest = Some((index, hit));
+            }
+        }
+        let Some((index, hit)) = nearest else { return Sample::default() };
+        let (solid, view) = (&self.world.solids[index], &self.views[index]);
+        Sample {
+            color: solid.color(view, hit, x, y, self.camera.pixel, &self.world.grain),
+            depth: hit.distance,
+            surface: (8 * index + hit.face + 1) as u32,
+            cosine: Solid::incidence(view, hit, x, y),
+        }
+    }
+
+    /// Boxes that may be seen between two corners of the image.
+    fn candidates(&self, left: f32, top: f32, right: f32, bottom: f32, list: &mut Vec<usize>) {
+        list.clear();
+        list.extend(self.bounds.iter().enumerate().filter_map(|(index, b)| {
+            (b[0] <= right && b[2] >= left && b[1] <= bottom && b[3] >= top).then_some(index)
+        }));
+    }
+}
+
+/// Renders frames of one world with one sensor; the same frame number gives the same noise.
+pub struct Renderer {
+    world: World,
+    camera: PinholeCamera,
+    image: ImageConfig,
+    depth: DepthConfig,
+    dropout: DropoutConfig,
+    noise: ChaCha8Rng,
+    quantiles: Vec<f32>,
+    samples: Vec<Sample>,
+    colors: Vec<[f32; 3]>,
+}
+
+impl Renderer {
+    pub fn new(
+        world: World,
+        camera: PinholeCamera,
+        image: ImageConfig,
+        depth: DepthConfig,
+        dropout: DropoutConfig,
+        seed: u64,
+    ) -> Self {
+        let pixels = image.width * image.height;
+        Self {
+            world,
+            camera,
+            image,
+            depth,
+            dropout,
+            noise: ChaCha8Rng::seed_from_u64(seed),
+            quantiles: quantiles(),
+            samples: vec![Sample::default(); pixels],
+            colors: vec![[0.0; 3]; pixels],
+        }
+    }
+
+    /// Color and depth (mm) of one shot; `None` if the image is empty.
+    pub fn render(&mut self, shot: &Shot) -> Option<(ColorImage, DepthImage)> {
+        let (width, height) = (self.image.width, self.image.height);
+        self.world.advance(shot.time);
+        let mut samples = std::mem::take(&mut self.samples);
+        let mut colors = std::mem::take(&mut self.colors);
+        let scene = self.scene(&shot.world_from_camera);
+        samples.par_chunks_mut(width * BAND).enumerate().for_each(|(band, rows)| {
+            trace_band(&scene, band * BAND, width, rows);
+        });
+        colors.par_chunks_mut(width).enumerate().for_each(|(row, colors)| {
+            self.smooth_edges(&scene, &samples, row, colors);
+        });
+        let mut color = vec![0_u8; 3 * width * height];
+        let mut depth = vec![0_u16; width * height];
+        color.par_chunks_mut(3 * width).zip(depth.par_chunks_mut(width)).enumerate().for_each(
+            |(row, (color, depth))| {
+                let mut noise = self.noise.clone();
+                noise.set_stream(shot.frame * height as u64 + row as u64);
+                let blur = Blur::new(&scene.camera, shot, self.image.shutter);
+                let film = Film { samples: &samples, colors: &colors, blur, light: shot.light };
+                self.expose(&film, row, noise, color, depth);
+            },
+        );
+        drop(scene);
+        (self.samples, self.colors) = (samples, colors);
+        let color = ColorImage::new(width, height, PixelFormat::Rgb8, color)?;
+        Some((color, DepthImage::new(width, height, 0.001, depth)?))
+    }
+
+    /// Copies the colors of one row, averaging finely where surfaces meet.
+    fn smooth_edges(&self, scene: &Scene, samples: &[Sample], row: usize, colors: &mut [[f32; 3]]) {
+        let mut candidates = Vec::new();
+        for (column, color) in colors.iter_mut().enumerate() {
+            let around = self.neighbours(samples, column, row);
+            *color = around.center.color;
+            if around.surface_edge() {
+                let (x, y) = (column as f32, row as f32);
+                scene.candidates(x - 1.0, y - 1.0, x + 1.0, y + 1.0, &mut candidates);
+                *color = supersampled(scene, x, y, &candidates);
+            }
+        }
+    }
+
+    fn neighbours(&self, samples: &[Sample], column: usize, row: usize) -> Neighbours {
+        let (width, height) = (self.image.width, self.image.height);
+        let at = |x: usize, y: usize| samples[y * width + x];
+        let around = [
+            at(column.saturating_sub(1), row),
+            at((column + 1).min(width - 1), row),
+            at(column, row.saturating_sub(1)),
+            at(column, (row + 1).min(height - 1)),
+        ];
+        Neighbours { center: at(column, row), around }
+    }
+
+    fn scene(&self, world_from_camera: &Isometry3<f64>) -> Scene<'_> {
+        let pose: Isometry3<f32> = world_from_camera.cast();
+        let camera_from_world = pose.inverse();
+        let views = self.world.solids.iter().map(|solid| solid.view(&pose)).collect();
+        let bounds =
+            self.world.solids.iter().map(|solid| self.bounds(solid, &camera_from_world)).collect();
+        let camera = Lens {
+            center: [self.camera.cx as f32, self.camera.cy as f32],
+            pixel: [1.0 / self.camera.fx as f32, 1.0 / self.camera.fy as f32],
+        };
+        Scene { world: &self.world, views, bounds, camera }
+    }
+
+    fn bounds(&self, solid: &Solid, camera_from_world: &Isometry3<f32>) -> [f32; 4] {
+        const ALL: [f32; 4] = [f32::MIN, f32::MIN, f32::MAX, f32::MAX];
+        const NONE: [f32; 4] = [f32::MAX, f32::MAX, f32::MIN, f32::MIN];
+        if solid.inside_out {
+            return ALL;
+        }
+        let corners = solid.corners().map(|c| camera_from_world * nalgebra::Point3::from(c));
+        if corners.iter().all(|c| c.z <= NEAR) {
+            return NONE;
+        }
+        if corners.iter().any(|c| c.z <= NEAR) {
+            return ALL;
+        }
+        corners.iter().fold(NONE, |b, c| {
+            let x = c.x / c.z * self.camera.fx as f32 + self.camera.cx as f32;
+            let y = c.y / c.z * self.camera.fy as f32 + self.camera.cy as f32;
+            [b[0].min(x - 1.0), b[1].min(y - 1.0), b[2].max(x + 1.0), b[3].max(y + 1.0)]
+        })
+    }
+
+    /// Turns one row into pixel values.
+    fn expose(
+        &self,
+        film: &Film,
+        row: usize,
+        mut noise: ChaCha8Rng,
+        color: &mut [u8],
+        depth: &mut [u16],
+    ) {
+        let (width, height) = (self.image.width, self.image.height);
+        let gain = ((self.image.exposure * film.light) as f32).sqrt();
+        let sd = self.image.noise as f32;
+        let middle = [0.5 * (width as f32 - 1.0), 0.5 * (height as f32 - 1.0)];
+        let corner = (middle[0] * middle[0] + middle[1] * middle[1]).max(1.0);
+        for column in 0..width {
+            let around = self.neighbours(film.samples, column, row);
+            let value = film.blurred(width, height, column, row, around.center.depth);
+            let (x, y) = (column as f32 - middle[0], row as f32 - middle[1]);
+            let light = 1.0 - self.image.vignetting as f32 * (x * x + y * y) / corner;
+            let factor = gain * light.max(0.0).sqrt();
+            let random = noise.next_u64();
+            for (k, value) in value.iter().enumerate() {
+                let grain = sd * self.quantile(random >> (12 * k));
+                color[3 * column + k] = (value * factor + grain + 0.5).clamp(0.0, 255.0) as u8;
+            }
+            depth[column] = self.measured_depth(&around, random >> 36);
+        }
+    }
+
+    /// Depth in mm from 28 random bits; 0 where there is none.
+    fn measured_depth(&self, around: &Neighbours, random: u64) -> u16 {
+        let sample = around.center;
+        let chance = ((random >> 12) & 0xffff) as f64 / 65536.0;
+        let edge = around.depth_edge(self.depth.edge_fraction as f32);
+        let lost = if edge { self.dropout.edges } else { self.dropout.anywhere };
+        if chance < lost || f64::from(sample.cosine) < self.dropout.grazing_cosine {
+            return 0;
+        }
+        let truth = f64::from(sample.depth);
+        let sigma = self.depth.standard_deviation(truth);
+        let measured = truth + sigma * f64::from(self.quantile(random));
+        let usable = measured >= self.depth.min && measured <= self.depth.max;
+        // Millimetres; a cast from a float saturates, so a huge range cannot wrap.
+        if usable { (measured * 1000.0).round() as u16 } else { 0 }
+    }
+
+    /// Standard normal value for the lowest 12 bits.
+    fn quantile(&self, random: u64) -> f32 {
+        self.quantiles[(random & 0xfff) as usize]
+    }
+}
+
+/// 4096 equally likely values of the standard normal distribution, scaled to unit variance.
+fn quantiles() -> Vec<f32> {
+    let raw: Vec<f64> = (0..4096)
+        .map(|i| std::f64::consts::SQRT_2 * erf_inv((f64::from(i) + 0.5) / 2048.0 - 1.0))
+        .collect();
+    let sd = (raw.iter().map(|x| x * x).sum::<f64>() / 4096.0).sqrt();
+    raw.into_iter().map(|x| (x / sd) as f32).collect()
+}
+
+fn trace_band(scene: &Scene, first_row: usize, width: usize, samples: &mut [Sample]) {
+    let rows = samples.len() / width;
+    let mut candidates = Vec::new();
+    for left in (0..width).step_by(TILE) {
+        let right = (left + TILE).min(width);
+        let (top, bottom) = (first_row as f32, (first_row + rows) as f32);
+        scene.candidates(left as f32, top, right as f32, bottom, &mut candidates);
+        for row in 0..rows {
+            for column in left..right {
+                samples[row * width + column] =
+                    scene.trace(column as f32, (first_row + row) as f32, &candidates);
+            }
+        }
+    }
+}
+
+/// Mean over the four quarters of a pixel.
+fn supersampled(scene: &Scene, x: f32, y: f32, candidates: &[usize]) -> [f32; 3] {
+    let mut sum = [0.0_f32; 3];
+    for (dx, dy) in [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)] {
+        let sample = scene.trace(x + dx, y + dy, candidates);
+        sum.iter_mut().zip(sample.color).for_each(|(s, c)| *s += 0.25 * c);
+    }
+    sum
+}
+
+/// Speed of image points, as far as the camera's motion makes it.
+#[derive(Debug, Clone, Copy)]
+struct Blur {
+    lens: Lens,
+    /// Displacement of the camera while the shutter is open, m and rad.
+    shift: Vector3<f32>,
+    turn: Vector3<f32>,
+}
+
+impl Blur {
+    fn new(lens: &Lens, shot: &Shot, shutter: f64) -> Self {
+        let scaled = |v: Vector3<f64>| (v * shutter).cast::<f32>();
+        Self { lens: *lens, shift: scaled(shot.velocity), turn: scaled(shot.angular_velocity) }
+    }
+
+    /// How far the point seen at a pixel moves while the shutter is open, pixels.
+    fn path(&self, column: f32, row: f32, depth: f32) -> [f32; 2] {
+        let (x, y) = self.lens.direction(column, row);
+        let point = Vector3::new(x, y, 1.0);
+        let change = -self.shift / depth.max(NEAR) - self.turn.cross(&point);
+        [
+            (change.x - x * change.z) / self.lens.pixel[0],
+            (change.y - y * change.z) / self.lens.pixel[1],
+        ]
+    }
+}
+
+/// The traced image before exposure.
+struct Film<'a> {
+    samples: &'a [Sample],
+    colors: &'a [[f32; 3]],
+    blur: Blur,
+    /// Factor on the light in the room.
+    light: f64,
+}
+
+impl Film<'_> {
+    /// Mean color along the path of the point at a pixel.
+    fn blurred(&self, width: usize, height: usize, column: usize, row: usize, z: f32) -> [f32; 3] {
+        const MAX_TAPS: f32 = 24.0;
+        let path = self.blur.path(column as f32, row as f32, z);
+        let taps = path[0].hypot(path[1]).ceil().clamp(1.0, MAX_TAPS);
+        if taps == 1.0 {
+            return self.colors[row * width + column];
+        }
+        let mut sum = [0.0_f32; 3];
+        for k in 0..taps as usize {
+            let along = (k as f32 + 0.5) / taps - 0.5;
+            let x = (column as f32 + along * path[0]).round().clamp(0.0, width as f32 - 1.0);
+            let y = (row as f32 + along * path[1]).round().clamp(0.0, height as f32 - 1.0);
+            let color = self.colors[y as usize * width + x as usize];
+            sum.iter_mut().zip(color).for_each(|(s, c)| *s += c / taps);
+        }
+        sum
+    }
+}
+
+/// A sample and the four next to it.
+struct Neighbours {
+    center: Sample,
+    around: [Sample; 4],
+}
+
+impl Neighbours {
+    fn surface_edge(&self) -> bool {
+        self.around.iter().any(|s| s.surface != self.center.surface)
+    }
+
+    fn depth_edge(&self, fraction: f32) -> bool {
+        let limit = fraction * self.center.depth;
+        self.surface_edge()
+            && self.around.iter().any(|s| (s.depth - self.center.depth).abs() > limit)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::world::{PeopleConfig, RoomConfig};
+    use super::*;
+
+    fn renderer(noise: f64) -> Renderer {
+        let room = RoomConfig { size: [6.0, 5.0, 2.8], clutter: 6, ..RoomConfig::default() };
+        let world = World::furnished(&room, &PeopleConfig::default(), &[Vector3::zeros()], 1);
+        let camera = PinholeCamera { fx: 120.0, fy: 120.0, cx: 79.5, cy: 59.5 };
+        let image = ImageConfig { width: 160, height: 120, noise, ..ImageConfig::default() };
+        Renderer::new(world, camera, image, DepthConfig::default(), DropoutConfig::default(), 7)
+    }
+
+    fn looking_ahead(frame: u64) -> Shot {
+        let axes = nalgebra::Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
+        let rotation = nalgebra::Rotation3::from_matrix_unchecked(axes);
+        Shot {
+            world_from_camera: Isometry3::from_parts(
+                Vector3::new(0.0, 0.0, 1.4).into(),
+                rotation.into(),
+            ),
+            velocity: Vector3::zeros(),
+            angular_velocity: Vector3::zeros(),
+            time: 0.0,
+            light: 1.0,
+            frame,
+        }
+    }
+
+    #[test]
+    fn frames_do_not_depend_on_the_number_of_threads() {
+        let render = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| renderer(2.0).render(&looking_ahead(3)).unwrap())
+        };
+        assert_eq!(render(1), render(3));
+    }
+
+    #[test]
+    fn an_empty_room_has_the_depth_of_its_walls() {
+        let room = RoomConfig { size: [6.0, 5.0, 2.8], clutter: 0, ..RoomConfig::default() };
+        let world = World::furnished(&room, &PeopleConfig::default(), &[], 1);
+        let mut renderer = Renderer { world, ..renderer(0.0) };
+        renderer.dropout = DropoutConfig { anywhere: 0.0, edges: 0.0, grazing_cosine: 0.0 };
+        let (_, depth) = renderer.render(&looking_ahead(0)).unwrap();
+        // The wall ahead is at 3 m; the pixel 50 rows below the centre sees the floor.
+        let ahead = depth.at(80, 60).unwrap();
+        let law = DepthConfig::default();
+        assert!((f64::from(ahead) - 3.0).abs() < 4.0 * law.standard_deviation(3.0) + 5e-4);
+        let truth = 1.4 * 120.0 / (115.0 - 59.5);
+        assert!((f64::from(depth.at(80, 115).unwrap()) - truth).abs() < 0.06, "{truth}");
+    }
+
+    #[test]
+    fn noise_has_the_stated_spread() {
+        let (clean, _) = renderer(0.0).render(&looking_ahead(3)).unwrap();
+        let (noisy, _) = renderer(3.0).render(&looking_ahead(3)).unwrap();
+        let differences: Vec<f64> = clean
+            .data()
+            .iter()
+            .zip(noisy.data())
+            .filter(|(c, _)| (20..235).contains(*c))
+            .map(|(a, b)| f64::from(*b) - f64::from(*a))
+            .collect();
+        let n = differences.len() as f64;
+        let variance = differences.iter().map(|d| d * d).sum::<f64>() / n;
+        assert!(n > 1e4 && (variance.sqrt() - 3.0).abs() < 0.15, "{n} {variance}");
+    }
+}

@@ -1,0 +1,331 @@
+use nalgebra::{Isometry3, Vector3};
+
+use super::config::{SceneConfig, SceneError};
+use super::inertial::ImuSimulator;
+use super::motion::{BodyState, Motion};
+use super::render::{Renderer, Shot};
+use super::world::{RoomConfig, World};
+use crate::dataset::{Event, LogWriter, RgbdFrame, TruthPose, WriteError};
+use crate::inertial::Stamp;
+use crate::vision::PinholeCamera;
+
+/// Runs through a scene and yields what its sensors see, ordered by stamp.
+pub struct Simulation {
+    config: SceneConfig,
+    motion: Motion,
+    body_from_camera: Isometry3<f64>,
+    renderer: Renderer,
+    imu: ImuSimulator,
+    start: Stamp,
+    imu_samples: Ticks,
+    truth_poses: Ticks,
+    frames: Ticks,
+}
+
+/// Times `k / rate` up to a duration, exact for any `k`.
+#[derive(Debug, Clone, Copy)]
+struct Ticks {
+    next: u64,
+    rate: f64,
+    duration: f64,
+}
+
+impl Ticks {
+    fn new(rate: f64, duration: f64) -> Self {
+        Self { next: 0, rate, duration }
+    }
+
+    /// Time of the next tick (s), infinite at the end.
+    fn time(&self) -> f64 {
+        let time = self.next as f64 / self.rate;
+        if self.rate > 0.0 && time <= self.duration { time } else { f64::INFINITY }
+    }
+}
+
+impl Simulation {
+    /// Builds the world; takes about a second for a furnished room.
+    pub fn new(mut config: SceneConfig) -> Result<Self, SceneError> {
+        let body_from_camera = config.validate()?;
+        let start = Stamp::from_seconds(config.start_time).ok_or_else(|| SceneError::Value {
+            key: "start_time",
+            value: config.start_time.to_string(),
+            requirement: "must fit into 64-bit nanoseconds",
+        })?;
+        let seed = |stream: u64| config.seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ stream;
+        let motion = if config.trajectory.file.as_os_str().is_empty() {
+            Motion::built_in(&config.motion, &body_from_camera, seed(1))
+        } else {
+            Motion::recorded(&config.motion, &config.trajectory, &body_from_camera)?
+        };
+        config.duration = duration(&config, &motion)?;
+        let path: Vec<Vector3<f64>> = (0..(config.duration * 4.0) as usize + 1)
+            .map(|k| motion.state(k as f64 / 4.0).world_from_body.translation.vector)
+            .collect();
+        config.room.size = room_around(&config.room, &path)?;
+        let world = World::furnished(&config.room, &config.people, &path, seed(2));
+        let renderer = Renderer::new(
+            world,
+            PinholeCamera::from(&config.camera),
+            config.image.clone(),
+            config.depth.clone(),
+            config.dropout.clone(),
+            seed(3),
+        );
+        let imu = ImuSimulator::new(config.imu.clone(), seed(4));
+        let ticks = |rate| Ticks::new(rate, config.duration);
+        let (imu_samples, truth_poses, frames) =
+            (ticks(config.imu.rate), ticks(config.truth.rate), ticks(config.image.rate));
+        Ok(Self {
+            config,
+            motion,
+            body_from_camera,
+            renderer,
+            imu,
+            start,
+            imu_samples,
+            truth_poses,
+            frames,
+        })
+    }
+
+    pub fn config(&self) -> &SceneConfig {
+        &self.config
+    }
+
+    /// Stamp of the first sample.
+    pub fn start(&self) -> Stamp {
+        self.start
+    }
+
+    /// The truth at a stamp.
+    pub fn state(&self, stamp: Stamp) -> BodyState {
+        self.motion.state(stamp.seconds_since(self.start))
+    }
+
+    /// Writes the mounting of the camera; to be called before the first event is written.
+    pub fn write_calibration(&self, log: &mut LogWriter) -> Result<(), WriteError> {
+        log.camera_info(&self.config.camera, self.start)
+    }
+
+    /// Pose and motion of the camera at a stamp of the IMU's clock.
+    fn shot(&self, stamp: Stamp, frame: u64) -> Shot {
+        let time = stamp.seconds_since(self.start);
+        let state = self.motion.state(time);
+        let lever = self.body_from_camera.translation.vector;
+        let body = state.world_from_body.rotation;
+        let velocity = state.velocity + body * state.angular_velocity.cross(&lever);
+        let camera_from_body = self.body_from_camera.rotation.inverse();
+        Shot {
+            world_from_camera: state.world_from_body * self.body_from_camera,
+            velocity: camera_from_body * (body.inverse() * velocity),
+            angular_velocity: camera_from_body * state.angular_velocity,
+            time,
+            light: self.config.light.at(time),
+            frame,
+        }
+    }
+
+    fn frame(&mut self, stamp: Stamp, number: u64) -> Option<RgbdFrame> {
+        // `time_offset` is added by the reader to get the IMU's clock, so it is taken off here.
+        let shot = self.shot(stamp, number);
+        let (color, depth) = self.renderer.render(&shot)?;
+        let stamp = stamp.offset_by(-self.config.camera.time_offset);
+        Some(RgbdFrame { stamp, color, depth })
+    }
+}
+
+impl Iterator for Simulation {
+    type Item = Event;
+
+    fn next(&mut self) -> Option<Event> {
+        let at_camera = self.frames.time() - self.config.camera.time_offset;
+        let (imu, truth) = (self.imu_samples.time(), self.truth_poses.time());
+        let earliest = imu.min(truth).min(at_camera);
+        if !earliest.is_finite() {
+            return None;
+        }
+        if imu == earliest {
+            self.imu_samples.next += 1;
+            let stamp = self.start.offset_by(imu);
+            let state = self.state(stamp);
+            return Some(Event::Imu(self.imu.sample(stamp, &state)));
+        }
+        if truth == earliest {
+            self.truth_poses.next += 1;
+            let stamp = self.start.offset_by(truth);
+            let world_from_body = self.state(stamp).world_from_body;
+            return Some(Event::Truth(TruthPose { stamp, world_from_body }));
+        }
+        let (number, stamp) = (self.frames.next, self.start.offset_by(self.frames.time()));
+        self.frames.next += 1;
+        self.frame(stamp, number).map(|frame| Event::Frame(Box::new(frame)))
+    }
+}
+
+/// The configured duration, or all of the motion.
+fn duration(config: &SceneConfig, motion: &Motion) -> Result<f64, SceneError> {
+    const BUILT_IN: f64 = 10.0;
+    let available = motion.duration();
+    match (config.duration, available) {
+        (wanted, Some(available)) if wanted > available => {
+            Err(SceneError::TooLong { wanted, available })
+        }
+        (wanted, _) if wanted > 0.0 => Ok(wanted),
+        (_, available) => Ok(available.unwrap_or(BUILT_IN)),
+    }
+}
+
+/// The size of the room, enlarged where the path and the furniture around it need more.
+fn room_around(room: &RoomConfig, path: &[Vector3<f64>]) -> Result<[f64; 3], SceneError> {
+    const FURNITURE: f64 = 0.6;
+    const HEADROOM: f64 = 0.4;
+    let reach = |axis: usize| path.iter().map(|p| p[axis].abs()).fold(0.0, f64::max);
+    let side = |axis: usize| 2.0 * (reach(axis) + room.clearance + FURNITURE);
+    let needed = [side(0), side(1), reach(2) + HEADROOM];
+    let size = std::array::from_fn(|k| room.size[k].max(needed[k]));
+    let limit = SceneConfig::MAX_ROOM;
+    if size.iter().all(|s| *s <= limit) {
+        Ok(size)
+    } else {
+        Err(SceneError::PathTooWide { size, limit })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Point2;
+
+    use super::*;
+    use crate::vision::{ColorImage, DepthConfig};
+
+    /// A quarter-size camera in a small room, without noise.
+    fn small_scene() -> SceneConfig {
+        let mut scene = SceneConfig { duration: 3.0, ..SceneConfig::default() };
+        scene.room = RoomConfig { size: [4.5, 4.5, 2.6], clutter: 8, ..scene.room };
+        scene.motion.standstill = 0.5;
+        scene.image.width = 160;
+        scene.image.height = 120;
+        scene.image.rate = 10.0;
+        scene.image.noise = 0.0;
+        scene.image.vignetting = 0.0;
+        scene.image.shutter = 0.0;
+        scene.camera.fx = 115.0;
+        scene.camera.fy = 115.0;
+        scene.camera.cx = 79.5;
+        scene.camera.cy = 59.5;
+        scene.dropout.anywhere = 0.0;
+        scene
+    }
+
+    fn frames(scene: &SceneConfig) -> Vec<RgbdFrame> {
+        let simulation = Simulation::new(scene.clone()).unwrap();
+        let frame = |event| match event {
+            Event::Frame(frame) => Some(*frame),
+            _ => None,
+        };
+        simulation.filter_map(frame).collect()
+    }
+
+    fn green(image: &ColorImage, pixel: Point2<f64>) -> Option<f64> {
+        let (x, y) = (pixel.x.floor(), pixel.y.floor());
+        let inside = x >= 0.0
+            && y >= 0.0
+            && x + 1.0 < image.width() as f64
+            && y + 1.0 < image.height() as f64;
+        let at = |x: f64, y: f64| {
+            f64::from(image.data()[3 * (y as usize * image.width() + x as usize) + 1])
+        };
+        let (fx, fy) = (pixel.x - x, pixel.y - y);
+        inside.then(|| {
+            (at(x, y) * (1.0 - fx) + at(x + 1.0, y) * fx) * (1.0 - fy)
+                + (at(x, y + 1.0) * (1.0 - fx) + at(x + 1.0, y + 1.0) * fx) * fy
+        })
+    }
+
+    #[test]
+    fn events_are_ordered_and_complete() {
+        let mut scene = small_scene();
+        scene.duration = 1.0;
+        scene.camera.time_offset = 0.02;
+        let events: Vec<Event> = Simulation::new(scene).unwrap().collect();
+        assert!(events.windows(2).all(|pair| pair[0].stamp() <= pair[1].stamp()));
+        let count = |pick: fn(&Event) -> bool| events.iter().filter(|e| pick(e)).count();
+        assert_eq!(count(|e| matches!(e, Event::Imu(_))), 201);
+        assert_eq!(count(|e| matches!(e, Event::Truth(_))), 121);
+        assert_eq!(count(|e| matches!(e, Event::Frame(_))), 11);
+    }
+
+    /// Pixels carried by depth and true poses to a later frame find the same depth and, to a
+    /// fraction of a pixel, the same texture there.
+    #[test]
+    fn truth_carries_pixels_from_frame_to_frame() {
+        let scene = small_scene();
+        let simulation = Simulation::new(scene.clone()).unwrap();
+        let frames = frames(&scene);
+        let (first, later) = (&frames[20], &frames[23]);
+        let mount = scene.camera.imu_from_camera().unwrap();
+        let pose = |frame: &RgbdFrame| simulation.state(frame.stamp).world_from_body * mount;
+        let later_from_first = pose(later).inv_mul(&pose(first));
+        assert!(later_from_first.translation.vector.norm() > 0.03);
+        let camera = PinholeCamera::from(&scene.camera);
+        let law: &DepthConfig = &scene.depth;
+        let (mut seen, mut agreeing) = (0, 0);
+        // Squared color differences with the landing point moved by half a pixel each way.
+        let moves = [(0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)];
+        let mut difference = [0.0; 5];
+        for row in 4..116 {
+            for column in 4..156 {
+                let Some(depth) = first.depth.at(column, row) else { continue };
+                let pixel = Point2::new(column as f64, row as f64);
+                let point = later_from_first
+                    * nalgebra::Point3::from(camera.unproject(pixel, depth.into()));
+                let Some(landed) = camera.project(&point.coords) else { continue };
+                let (x, y) = (landed.x.round(), landed.y.round());
+                if !(4.0..156.0).contains(&x) || !(4.0..116.0).contains(&y) {
+                    continue;
+                }
+                let Some(found) = later.depth.at(x as usize, y as usize) else { continue };
+                seen += 1;
+                // Both readings are noisy, and a pixel spans some depth on slanted surfaces.
+                let sigma = law.standard_deviation(point.z) * std::f64::consts::SQRT_2;
+                if (f64::from(found) - point.z).abs() > 2.0 * sigma + 0.01 * point.z {
+                    continue;
+                }
+                agreeing += 1;
+                let colors = moves
+                    .map(|(dx, dy)| green(&later.color, Point2::new(landed.x + dx, landed.y + dy)));
+                let Some(reference) = green(&first.color, pixel) else { continue };
+                for (sum, color) in difference.iter_mut().zip(colors) {
+                    *sum += color.map_or(0.0, |c| (c - reference).powi(2));
+                }
+            }
+        }
+        assert!(seen > 5000, "{seen}");
+        // What is hidden in one of the frames may disagree.
+        assert!(f64::from(agreeing) > 0.9 * f64::from(seen), "{agreeing} of {seen}");
+        assert!(difference[1..].iter().all(|d| *d > 1.15 * difference[0]), "{difference:?}");
+    }
+
+    #[test]
+    fn the_seed_decides_everything() {
+        let mut scene = small_scene();
+        scene.duration = 0.2;
+        let run = |scene: &SceneConfig| -> Vec<Event> {
+            Simulation::new(scene.clone()).unwrap().collect()
+        };
+        let first = run(&scene);
+        assert_eq!(first, run(&scene));
+        scene.seed += 1;
+        assert_ne!(first, run(&scene));
+    }
+
+    #[test]
+    fn rooms_grow_around_the_path() {
+        let room = RoomConfig { size: [3.0, 3.0, 2.0], clearance: 0.5, ..RoomConfig::default() };
+        let path = [Vector3::new(-4.0, 0.0, 1.0), Vector3::new(2.0, 0.5, 1.9)];
+        let size = room_around(&room, &path).unwrap();
+        assert!((size[0] - 10.2).abs() < 1e-9 && (size[1] - 3.2).abs() < 1e-9, "{size:?}");
+        assert!((size[2] - 2.3).abs() < 1e-9);
+        assert!(room_around(&room, &[Vector3::new(80.0, 0.0, 1.0)]).is_err());
+    }
+}

@@ -1,0 +1,743 @@
+//! Procedural surfaces, painted once and read through mip maps.
+//!
+//! Patterns follow the "dead leaves" model of natural images (Lee, Mumford and Huang, 2001):
+//! opaque shapes whose sizes obey a cubic power law, so that there are corners and edges at every
+//! scale and no repetition. Colors are coded by their square root (gamma 2): light then still
+//! multiplies, and photon noise has the same spread everywhere.
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+/// Red, green, blue in gamma-2 coding, 0 to 255.
+pub type Color = [f32; 3];
+
+/// A painted rectangle with its mip levels; coordinates in metres from the first texel's corner.
+#[derive(Debug, Clone)]
+pub struct Texture {
+    levels: Vec<Level>,
+    /// Edge of a texel of the finest level, m.
+    texel: f32,
+    /// Whether coordinates wrap around instead of stopping at the border.
+    wraps: bool,
+}
+
+#[derive(Debug, Clone)]
+struct Level {
+    width: usize,
+    height: usize,
+    texels: Vec<[u8; 4]>,
+}
+
+impl Level {
+    fn halved(&self) -> Self {
+        let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
+        let mut texels = Vec::with_capacity(width * height);
+        for row in 0..height {
+            for column in 0..width {
+                let mut sum = [2_u16; 4];
+                for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                    let x = (2 * column + dx).min(self.width - 1);
+                    let y = (2 * row + dy).min(self.height - 1);
+                    let texel = self.texels[y * self.width + x];
+                    sum.iter_mut().zip(texel).for_each(|(s, t)| *s += u16::from(t));
+                }
+                texels.push(sum.map(|s| (s / 4) as u8));
+            }
+        }
+        Self { width, height, texels }
+    }
+
+    /// Bilinear value at texel coordinates (0 is the centre of the first texel).
+    fn bilinear(&self, x: f32, y: f32, wraps: bool) -> [f32; 4] {
+        let (left, top) = (x.floor(), y.floor());
+        let (fx, fy) = (x - left, y - top);
+        let column = |offset: i32| index(left as i32 + offset, self.width, wraps);
+        let row = |offset: i32| index(top as i32 + offset, self.height, wraps) * self.width;
+        let (x0, x1, y0, y1) = (column(0), column(1), row(0), row(1));
+        let corner = |i: usize| self.texels[i].map(f32::from);
+        let (a, b) = (corner(y0 + x0), corner(y0 + x1));
+        let (c, d) = (corner(y1 + x0), corner(y1 + x1));
+        std::array::from_fn(|k| {
+            let upper = a[k] + (b[k] - a[k]) * fx;
+            let lower = c[k] + (d[k] - c[k]) * fx;
+            upper + (lower - upper) * fy
+        })
+    }
+}
+
+fn index(i: i32, len: usize, wraps: bool) -> usize {
+    if wraps { i.rem_euclid(len as i32) as usize } else { i.clamp(0, len as i32 - 1) as usize }
+}
+
+impl Texture {
+    /// The mean over the parallelogram spanned by `dx` and `dy` (m) around `(u, v)` (m), by up to
+    /// four trilinear samples along its longer side.
+    pub fn sample(&self, u: f32, v: f32, dx: [f32; 2], dy: [f32; 2]) -> Color {
+        const MAX_SAMPLES: f32 = 4.0;
+        let (lx, ly) = (dx[0].hypot(dx[1]), dy[0].hypot(dy[1]));
+        let (long, axis, short) = if lx > ly { (lx, dx, ly) } else { (ly, dy, lx) };
+        let width = short.max(long / MAX_SAMPLES).max(1e-6);
+        let samples = (long / width).round().clamp(1.0, MAX_SAMPLES);
+        let lod = (width / self.texel).log2();
+        let mut sum = [0.0_f32; 4];
+        for i in 0..samples as usize {
+            let along = (i as f32 + 0.5) / samples - 0.5;
+            let value = self.trilinear(u + along * axis[0], v + along * axis[1], lod);
+            sum.iter_mut().zip(value).for_each(|(s, x)| *s += x);
+        }
+        [sum[0] / samples, sum[1] / samples, sum[2] / samples]
+    }
+
+    fn trilinear(&self, u: f32, v: f32, lod: f32) -> [f32; 4] {
+        let lod = lod.clamp(0.0, (self.levels.len() - 1) as f32);
+        let fine = lod as usize;
+        let blend = lod - fine as f32;
+        let at = |level: usize| {
+            let texel = self.texel * (1_u32 << level) as f32;
+            self.levels[level].bilinear(u / texel - 0.5, v / texel - 0.5, self.wraps)
+        };
+        let a = at(fine);
+        if blend < 0.02 || fine + 1 == self.levels.len() {
+            return a;
+        }
+        let b = at(fine + 1);
+        std::array::from_fn(|k| a[k] + (b[k] - a[k]) * blend)
+    }
+
+    /// A grey pattern of 2 cm shapes and below, `512 x 512` texels of 0.6 mm, that wraps around;
+    /// laid over the larger textures it gives close views something to see. Its mean is 128.
+    pub fn fine_grain(rng: &mut ChaCha8Rng) -> Self {
+        let texel = 0.0006;
+        let mut canvas = Canvas::new(512, 512, texel, [128.0; 3]);
+        let side = canvas.width();
+        for _ in 0..6000 {
+            let radius = power_law_radius(rng, 0.0008, 0.02);
+            let tone = 128.0 + rng.random_range(-70.0..70.0);
+            let (x, y) = (rng.random_range(0.0..side), rng.random_range(0.0..side));
+            let shape = Shape::random(rng);
+            // Painted once more across each border, so that the pattern has no seam.
+            for ox in [-side, 0.0, side] {
+                for oy in [-side, 0.0, side] {
+                    canvas.shape(shape, [x + ox, y + oy], radius, [tone; 3], 0.8);
+                }
+            }
+        }
+        let mean =
+            canvas.texels.iter().map(|t| f32::from(t[0])).sum::<f32>() / canvas.texels.len() as f32;
+        for texel in &mut canvas.texels {
+            *texel = texel.map(|t| (f32::from(t) - mean + 128.0).clamp(0.0, 255.0) as u8);
+        }
+        canvas.finish(true)
+    }
+}
+
+/// Radius with density proportional to `r^-3` between two limits.
+fn power_law_radius(rng: &mut ChaCha8Rng, min: f32, max: f32) -> f32 {
+    let (a, b) = (min.powi(-2), max.powi(-2));
+    (a + rng.random::<f32>() * (b - a)).powf(-0.5)
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Shape {
+    Disc,
+    Triangle { angle: f32 },
+    Rectangle { angle: f32, aspect: f32 },
+}
+
+impl Shape {
+    fn random(rng: &mut ChaCha8Rng) -> Self {
+        let angle = rng.random_range(0.0..std::f32::consts::TAU);
+        match rng.random_range(0..4) {
+            0 => Self::Disc,
+            1 => Self::Triangle { angle },
+            _ => Self::Rectangle { angle, aspect: rng.random_range(0.25..1.0) },
+        }
+    }
+
+    /// Signed distance (approximate outside of corners) to a shape of circumradius `radius`.
+    fn distance(self, x: f32, y: f32, radius: f32) -> f32 {
+        match self {
+            Self::Disc => x.hypot(y) - radius,
+            Self::Triangle { angle } => (0..3)
+                .map(|k| {
+                    let (s, c) = (angle + k as f32 * std::f32::consts::TAU / 3.0).sin_cos();
+                    c * x + s * y - 0.5 * radius
+                })
+                .fold(f32::MIN, f32::max),
+            Self::Rectangle { angle, aspect } => {
+                let (s, c) = angle.sin_cos();
+                let (along, across) = (c * x + s * y, c * y - s * x);
+                (along.abs() - radius).max(across.abs() - aspect * radius)
+            }
+        }
+    }
+}
+
+/// A rectangle on a canvas, m.
+#[derive(Debug, Clone, Copy)]
+struct Area {
+    x: f32,
+    y: f32,
+    width: f32,
+    height: f32,
+}
+
+impl Area {
+    fn inset(self, margin: f32) -> Self {
+        Self {
+            x: self.x + margin,
+            y: self.y + margin,
+            width: (self.width - 2.0 * margin).max(0.0),
+            height: (self.height - 2.0 * margin).max(0.0),
+        }
+    }
+}
+
+/// Where a surface is painted before its mip levels are made. Rows run along increasing `v`.
+struct Canvas {
+    columns: usize,
+    rows: usize,
+    texel: f32,
+    texels: Vec<[u8; 4]>,
+    clip: Area,
+}
+
+impl Canvas {
+    fn new(columns: usize, rows: usize, texel: f32, color: Color) -> Self {
+        let clip =
+            Area { x: 0.0, y: 0.0, width: columns as f32 * texel, height: rows as f32 * texel };
+        let texels = vec![pack(color); columns * rows];
+        Self { columns, rows, texel, texels, clip }
+    }
+
+    fn width(&self) -> f32 {
+        self.columns as f32 * self.texel
+    }
+
+    fn height(&self) -> f32 {
+        self.rows as f32 * self.texel
+    }
+
+    fn whole(&self) -> Area {
+        Area { x: 0.0, y: 0.0, width: self.width(), height: self.height() }
+    }
+
+    fn finish(self, wraps: bool) -> Texture {
+        let first = Level { width: self.columns, height: self.rows, texels: self.texels };
+        let mut levels = vec![first];
+        while let Some(last) = levels.last().filter(|l| l.width > 1 || l.height > 1) {
+            let next = last.halved();
+            levels.push(next);
+        }
+        Texture { levels, texel: self.texel, wraps }
+    }
+
+    /// Blends `color` in where `distance` (m, relative to `center`) is negative, with soft edges.
+    fn fill(
+        &mut self,
+        center: [f32; 2],
+        reach: [f32; 2],
+        color: Color,
+        opacity: f32,
+        distance: impl Fn(f32, f32) -> f32,
+    ) {
+        let per_metre = 1.0 / self.texel;
+        let range = |center: f32, reach: f32, low: f32, size: f32, count: usize| {
+            let first = (center - reach).max(low) * per_metre;
+            let last = (center + reach).min(low + size) * per_metre;
+            (first.floor().max(0.0) as usize, (last.ceil().max(0.0) as usize).min(count))
+        };
+        let clip = self.clip;
+        let (x0, x1) = range(center[0], reach[0] + self.texel, clip.x, clip.width, self.columns);
+        let (y0, y1) = range(center[1], reach[1] + self.texel, clip.y, clip.height, self.rows);
+        for row in y0..y1 {
+            let y = (row as f32 + 0.5) * self.texel - center[1];
+            for column in x0..x1 {
+                let x = (column as f32 + 0.5) * self.texel - center[0];
+                let alpha = opacity * (0.5 - distance(x, y) * per_metre).clamp(0.0, 1.0);
+                if alpha > 0.0 {
+                    blend(&mut self.texels[row * self.columns + column], color, alpha);
+                }
+            }
+        }
+    }
+
+    fn shape(&mut self, shape: Shape, center: [f32; 2], radius: f32, color: Color, opacity: f32) {
+        let reach = radius * std::f32::consts::SQRT_2;
+        self.fill(center, [reach; 2], color, opacity, |x, y| shape.distance(x, y, radius));
+    }
+
+    fn area(&mut self, area: Area, color: Color, opacity: f32) {
+        let half = [area.width / 2.0, area.height / 2.0];
+        let center = [area.x + half[0], area.y + half[1]];
+        let distance = |x: f32, y: f32| (x.abs() - half[0]).max(y.abs() - half[1]);
+        self.fill(center, half, color, opacity, distance);
+    }
+
+    /// A straight stroke.
+    fn stroke(&mut self, from: [f32; 2], to: [f32; 2], thickness: f32, color: Color) {
+        let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
+        let length = dx.hypot(dy).max(1e-6);
+        let (c, s) = (dx / length, dy / length);
+        let center = [(from[0] + to[0]) / 2.0, (from[1] + to[1]) / 2.0];
+        let reach = [dx.abs() / 2.0 + thickness, dy.abs() / 2.0 + thickness];
+        self.fill(center, reach, color, 1.0, |x, y| {
+            let (along, across) = (c * x + s * y, c * y - s * x);
+            (along.abs() - length / 2.0).max(across.abs() - thickness / 2.0)
+        });
+    }
+
+    /// Dead leaves over `area` until they would cover it `coverage` times.
+    fn leaves(&mut self, rng: &mut ChaCha8Rng, area: Area, leaves: &Leaves) {
+        let whole = self.clip;
+        self.clip = area;
+        let (min, max) = (leaves.min_radius, leaves.max_radius.min(area.width.max(area.height)));
+        if max > min {
+            let mean_square = 2.0 * (max / min).ln() / (min.powi(-2) - max.powi(-2));
+            let covered = leaves.coverage * area.width * area.height;
+            for _ in 0..(covered / (1.6 * mean_square)) as usize {
+                let center = [
+                    area.x + rng.random::<f32>() * area.width,
+                    area.y + rng.random::<f32>() * area.height,
+                ];
+                let radius = power_law_radius(rng, min, max);
+                let color = leaves.palette.pick(rng);
+                self.shape(Shape::random(rng), center, radius, color, leaves.opacity);
+            }
+        }
+        self.clip = whole;
+    }
+
+    /// Lines of strokes that look like print from afar.
+    fn print(&mut self, rng: &mut ChaCha8Rng, area: Area, height: f32, color: Color) {
+        let (advance, leading) = (0.75 * height, 1.6 * height);
+        let lines = (area.height / leading) as usize;
+        let columns = (area.width / advance) as usize;
+        for line in 0..lines {
+            let end = columns - (rng.random::<f32>() * 0.3 * columns as f32) as usize;
+            for column in 0..end {
+                if rng.random::<f32>() < 0.16 {
+                    continue;
+                }
+                let x = area.x + column as f32 * advance;
+                let y = area.y + line as f32 * leading;
+                for _ in 0..3 {
+                    let mut node = || {
+                        let (i, j) = (rng.random_range(0..3), rng.random_range(0..3));
+                        [x + 0.25 * height * i as f32, y + 0.5 * height * j as f32]
+                    };
+                    let (from, to) = (node(), node());
+                    self.stroke(from, to, 0.16 * height, color);
+                }
+            }
+        }
+    }
+
+    /// Multiplies by fractal value noise: octaves of period `period`, half of it, ... (m), each
+    /// weaker by 0.7; `stretch` lengthens it along `u`.
+    fn grain(&mut self, rng: &mut ChaCha8Rng, period: f32, stretch: f32, amplitude: f32) {
+        let mut factors = vec![0.0_f32; self.texels.len()];
+        let (mut period, mut weight) = (period / self.texel, amplitude);
+        while period >= 1.5 {
+            let (px, py) = (period * stretch, period);
+            let columns = (self.columns as f32 / px) as usize + 2;
+            let rows = (self.rows as f32 / py) as usize + 2;
+            let lattice: Vec<f32> =
+                (0..columns * rows).map(|_| rng.random_range(-weight..weight)).collect();
+            for row in 0..self.rows {
+                let y = row as f32 / py;
+                let (j, fy) = (y as usize, smooth(y.fract()));
+                let (upper, lower) = (&lattice[j * columns..], &lattice[(j + 1) * columns..]);
+                let line = &mut factors[row * self.columns..(row + 1) * self.columns];
+                for (column, factor) in line.iter_mut().enumerate() {
+                    let x = column as f32 / px;
+                    let (i, fx) = (x as usize, smooth(x.fract()));
+                    let a = upper[i] + (upper[i + 1] - upper[i]) * fx;
+                    let b = lower[i] + (lower[i + 1] - lower[i]) * fx;
+                    *factor += a + (b - a) * fy;
+                }
+            }
+            period /= 2.0;
+            weight *= 0.7;
+        }
+        for (texel, factor) in self.texels.iter_mut().zip(factors) {
+            *texel = texel.map(|t| (f32::from(t) * (1.0 + factor) + 0.5).clamp(0.0, 255.0) as u8);
+        }
+    }
+}
+
+fn smooth(x: f32) -> f32 {
+    x * x * (3.0 - 2.0 * x)
+}
+
+fn pack(color: Color) -> [u8; 4] {
+    let [r, g, b] = color.map(|c| c.clamp(0.0, 255.0) as u8);
+    [r, g, b, 0]
+}
+
+fn blend(texel: &mut [u8; 4], color: Color, alpha: f32) {
+    for (t, c) in texel.iter_mut().zip(color) {
+        let value = f32::from(*t);
+        *t = (value + (c - value) * alpha + 0.5).clamp(0.0, 255.0) as u8;
+    }
+}
+
+/// A few colors that go together.
+struct Palette(Vec<Color>);
+
+impl Palette {
+    /// `count` colors around one hue whose lightness spans `dark` to `light`.
+    fn around(rng: &mut ChaCha8Rng, count: usize, dark: f32, light: f32) -> Self {
+        let hue = rng.random::<f32>();
+        let colors = (0..count.max(2)).map(|i| {
+            let value = dark + (light - dark) * i as f32 / (count.max(2) - 1) as f32;
+            let shift = rng.random_range(-0.15..0.15) + if i % 3 == 2 { 0.5 } else { 0.0 };
+            from_hsv(hue + shift, rng.random_range(0.1..0.6), value)
+        });
+        Self(colors.collect())
+    }
+
+    fn pick(&self, rng: &mut ChaCha8Rng) -> Color {
+        let color = self.0[rng.random_range(0..self.0.len())];
+        let shade = rng.random_range(-18.0..18.0);
+        color.map(|c| c + shade)
+    }
+}
+
+/// Hue in turns, saturation 0 to 1, value 0 to 255.
+fn from_hsv(hue: f32, saturation: f32, value: f32) -> Color {
+    [0.0, 2.0 / 3.0, 1.0 / 3.0].map(|offset| {
+        let ramp = ((hue + offset).rem_euclid(1.0) * 6.0 - 3.0).abs() - 1.0;
+        value * (1.0 - saturation + saturation * ramp.clamp(0.0, 1.0))
+    })
+}
+
+/// Size range (m), amount and look of dead leaves.
+struct Leaves {
+    min_radius: f32,
+    max_radius: f32,
+    /// Painted area per canvas area.
+    coverage: f32,
+    opacity: f32,
+    palette: Palette,
+}
+
+/// What a face is made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Material {
+    /// Painted plaster with posters, notices and pictures.
+    Wall,
+    /// Suspended panels with lamps.
+    Ceiling,
+    /// Planks with rugs and stains.
+    Floor,
+    /// Cardboard with tape, labels and print.
+    Carton,
+    /// Grained wood, with drawers.
+    Wood,
+    /// Rows of book spines.
+    Books,
+    /// A busy print: cloth, pictures, screens.
+    Print,
+}
+
+/// Paints one face of `width` by `height` metres; `richness` from 0 (bare) to 1 (busy).
+pub fn paint(
+    material: Material,
+    width: f32,
+    height: f32,
+    richness: f32,
+    rng: &mut ChaCha8Rng,
+) -> Texture {
+    // About a million texels for the largest faces of a room; close up, the fine grain helps.
+    let texel = ((width * height).sqrt() / 1024.0).clamp(0.0015, 0.005);
+    let columns = (width / texel).ceil().max(1.0) as usize;
+    let rows = (height / texel).ceil().max(1.0) as usize;
+    let mut canvas = Canvas::new(columns, rows, texel, [128.0; 3]);
+    match material {
+        Material::Wall => wall(&mut canvas, rng, richness),
+        Material::Ceiling => ceiling(&mut canvas, rng),
+        Material::Floor => floor(&mut canvas, rng, richness),
+        Material::Carton => carton(&mut canvas, rng, richness),
+        Material::Wood => wood(&mut canvas, rng, richness),
+        Material::Books => books(&mut canvas, rng),
+        Material::Print => {
+            let whole = canvas.whole();
+            picture(&mut canvas, rng, whole);
+        }
+    }
+    canvas.finish(false)
+}
+
+fn wall(canvas: &mut Canvas, rng: &mut ChaCha8Rng, richness: f32) {
+    let whole = canvas.whole();
+    let tint = rng.random_range(0.0..1.0);
+    canvas.area(whole, from_hsv(tint, 0.08, 205.0), 1.0);
+    let marks = Leaves {
+        min_radius: 0.006,
+        max_radius: 0.35,
+        coverage: 0.35 * richness,
+        opacity: 0.16,
+        palette: Palette::around(rng, 5, 60.0, 240.0),
+    };
+    canvas.leaves(rng, whole, &marks);
+    canvas.grain(rng, 0.8, 1.0, 0.05);
+    let hung = (richness * 1.5 * whole.width * whole.height) as usize;
+    for _ in 0..hung {
+        let w = power_law_radius(rng, 0.16, 0.9).min(0.7 * whole.width);
+        let h = (w * rng.random_range(0.6..1.5)).min(0.7 * whole.height);
+        let area = Area {
+            x: rng.random::<f32>() * (whole.width - w),
+            y: rng.random::<f32>() * (whole.height - h),
+            width: w,
+            height: h,
+        };
+        canvas.area(Area { x: area.x + 0.012, y: area.y - 0.012, ..area }, [70.0; 3], 0.35);
+        sheet(canvas, rng, area);
+    }
+}
+
+/// A framed picture, a notice or a poster.
+fn sheet(canvas: &mut Canvas, rng: &mut ChaCha8Rng, area: Area) {
+    let frame = from_hsv(rng.random(), rng.random_range(0.0..0.5), rng.random_range(30.0..240.0));
+    canvas.area(area, frame, 1.0);
+    let inner = area.inset(rng.random_range(0.008..0.03));
+    if rng.random::<f32>() < 0.35 {
+        canvas.area(inner, [rng.random_range(200.0..245.0); 3], 1.0);
+        let ink = from_hsv(rng.random(), 0.5, rng.random_range(20.0..110.0));
+        let height = rng.random_range(0.012..0.05_f32).min(inner.height / 3.0);
+        canvas.print(rng, inner.inset(0.02), height, ink);
+    } else {
+        picture(canvas, rng, inner);
+    }
+}
+
+fn picture(canvas: &mut Canvas, rng: &mut ChaCha8Rng, area: Area) {
+    let dark = rng.random_range(15.0..90.0);
+    let light = rng.random_range(150.0..250.0);
+    let palette = Palette::around(rng, 7, dark, light);
+    canvas.area(area, palette.pick(rng), 1.0);
+    let largest = 0.45 * area.width.max(area.height);
+    let pattern =
+        Leaves { min_radius: 0.005, max_radius: largest, coverage: 2.2, opacity: 0.95, palette };
+    canvas.leaves(rng, area, &pattern);
+}
+
+fn ceiling(canvas: &mut Canvas, rng: &mut ChaCha8Rng) {
+    let whole = canvas.whole();
+    canvas.area(whole, [190.0, 190.0, 186.0], 1.0);
+    let speckle = Leaves {
+        min_radius: 0.004,
+        max_radius: 0.05,
+        coverage: 0.25,
+        opacity: 0.3,
+        palette: Palette(vec![[150.0; 3], [120.0; 3], [215.0; 3]]),
+    };
+    canvas.leaves(rng, whole, &speckle);
+    let step = 0.6;
+    for i in 0..(whole.width / step) as usize + 1 {
+        for j in 0..(whole.height / step) as usize + 1 {
+            let area = Area { x: i as f32 * step, y: j as f32 * step, width: step, height: step };
+            match rng.random_range(0..12) {
+                0 => canvas.area(area.inset(0.03), [253.0; 3], 1.0),
+                1 => grille(canvas, area.inset(0.08)),
+                _ => canvas.area(area, [rng.random_range(150.0..230.0); 3], 0.25),
+            }
+        }
+    }
+    lattice(canvas, step, 0.012, [110.0; 3]);
+}
+
+fn grille(canvas: &mut Canvas, area: Area) {
+    canvas.area(area, [90.0; 3], 1.0);
+    let slats = (area.height / 0.04) as usize;
+    for k in 0..slats {
+        let y = area.y + k as f32 * 0.04;
+        canvas.area(Area { y, height: 0.016, ..area }, [205.0; 3], 1.0);
+    }
+}
+
+fn lattice(canvas: &mut Canvas, step: f32, thickness: f32, color: Color) {
+    let whole = canvas.whole();
+    for i in 0..(whole.width / step) as usize + 1 {
+        let x = i as f32 * step - thickness / 2.0;
+        canvas.area(Area { x, width: thickness, ..whole }, color, 1.0);
+    }
+    for j in 0..(whole.height / step) as usize + 1 {
+        let y = j as f32 * step - thickness / 2.0;
+        canvas.area(Area { y, height: thickness, ..whole }, color, 1.0);
+    }
+}
+
+fn floor(canvas: &mut Canvas, rng: &mut ChaCha8Rng, richness: f32) {
+    let whole = canvas.whole();
+    let hue = rng.random_range(0.05..0.11);
+    let board = 0.14;
+    for row in 0..(whole.height / board) as usize + 1 {
+        let mut x = -rng.random::<f32>();
+        while x < whole.width {
+            let length = rng.random_range(0.5..1.3);
+            let tone = from_hsv(hue, 0.4, rng.random_range(115.0..185.0));
+            let area = Area { x, y: row as f32 * board, width: length, height: board };
+            canvas.area(area, [55.0, 42.0, 34.0], 1.0);
+            canvas.area(area.inset(0.003), tone, 1.0);
+            x += length;
+        }
+    }
+    canvas.grain(rng, 0.08, 8.0, 0.14);
+    let rugs = (richness * whole.width * whole.height / 9.0) as usize;
+    for _ in 0..rugs {
+        let (w, h) = (rng.random_range(0.8..2.2), rng.random_range(0.6..1.6));
+        let area = Area {
+            x: rng.random::<f32>() * (whole.width - w).max(0.0),
+            y: rng.random::<f32>() * (whole.height - h).max(0.0),
+            width: w,
+            height: h,
+        };
+        picture(canvas, rng, area);
+    }
+    let stains = Leaves {
+        min_radius: 0.004,
+        max_radius: 0.12,
+        coverage: 0.25 * richness,
+        opacity: 0.45,
+        palette: Palette::around(rng, 6, 30.0, 220.0),
+    };
+    canvas.leaves(rng, whole, &stains);
+}
+
+fn carton(canvas: &mut Canvas, rng: &mut ChaCha8Rng, richness: f32) {
+    let whole = canvas.whole();
+    let base = from_hsv(rng.random_range(0.06..0.1), 0.42, rng.random_range(150.0..200.0));
+    canvas.area(whole, base, 1.0);
+    let scuffs = Leaves {
+        min_radius: 0.003,
+        max_radius: 0.08,
+        coverage: 0.5 * richness,
+        opacity: 0.3,
+        palette: Palette::around(rng, 4, 50.0, 220.0),
+    };
+    canvas.leaves(rng, whole, &scuffs);
+    canvas.grain(rng, 0.1, 1.0, 0.08);
+    let tape = Area { y: 0.45 * whole.height, height: 0.05, ..whole };
+    canvas.area(tape, [205.0, 190.0, 150.0], 0.7);
+    for _ in 0..rng.random_range(1..4) {
+        let w = rng.random_range(0.2..0.6) * whole.width;
+        let h = rng.random_range(0.2..0.5) * whole.height;
+        let area = Area {
+            x: rng.random::<f32>() * (whole.width - w),
+            y: rng.random::<f32>() * (whole.height - h),
+            width: w,
+            height: h,
+        };
+        sheet(canvas, rng, area);
+    }
+}
+
+fn wood(canvas: &mut Canvas, rng: &mut ChaCha8Rng, richness: f32) {
+    let whole = canvas.whole();
+    let hue = rng.random_range(0.04..0.12);
+    canvas.area(whole, from_hsv(hue, 0.45, rng.random_range(90.0..190.0)), 1.0);
+    canvas.grain(rng, 0.05, 10.0, 0.2);
+    let drawers = (whole.height / 0.3) as usize;
+    for k in 0..drawers {
+        let y = k as f32 * whole.height / drawers as f32;
+        let area = Area { y, height: whole.height / drawers as f32, ..whole };
+        canvas.area(Area { height: 0.008, ..area }, [40.0, 30.0, 24.0], 1.0);
+        let handle = Area {
+            x: 0.4 * whole.width,
+            y: y + 0.45 * area.height,
+            width: 0.2 * whole.width,
+            height: 0.02,
+        };
+        canvas.area(handle, [215.0; 3], 1.0);
+    }
+    let marks = Leaves {
+        min_radius: 0.003,
+        max_radius: 0.1,
+        coverage: 0.3 * richness,
+        opacity: 0.5,
+        palette: Palette::around(rng, 5, 30.0, 230.0),
+    };
+    canvas.leaves(rng, whole, &marks);
+}
+
+fn books(canvas: &mut Canvas, rng: &mut ChaCha8Rng) {
+    let whole = canvas.whole();
+    canvas.area(whole, [60.0, 46.0, 36.0], 1.0);
+    let shelves = ((whole.height / 0.34) as usize).max(1);
+    let pitch = whole.height / shelves as f32;
+    for shelf in 0..shelves {
+        let bottom = shelf as f32 * pitch + 0.025;
+        let mut x = 0.02;
+        while x < whole.width - 0.03 {
+            let thickness = rng.random_range(0.015..0.06_f32).min(whole.width - 0.02 - x);
+            let height = (pitch - 0.03) * rng.random_range(0.6..0.97);
+            let spine = Area { x, y: bottom, width: thickness, height };
+            let value = rng.random_range(40.0..235.0);
+            canvas.area(spine, from_hsv(rng.random(), rng.random_range(0.1..0.8), value), 1.0);
+            canvas.area(Area { width: 0.002, ..spine }, [20.0; 3], 0.8);
+            let ink = if value > 130.0 { [25.0; 3] } else { [235.0; 3] };
+            let title = Area {
+                x: x + 0.2 * thickness,
+                y: bottom + rng.random_range(0.1..0.3) * height,
+                width: 0.6 * thickness,
+                height: 0.5 * height,
+            };
+            canvas.print(rng, title, (0.5 * thickness).clamp(0.006, 0.02), ink);
+            x += thickness + if rng.random::<f32>() < 0.08 { 0.08 } else { 0.001 };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+
+    use super::*;
+
+    #[test]
+    fn a_wide_footprint_reads_the_mean() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let texture = paint(Material::Print, 1.0, 1.0, 1.0, &mut rng);
+        let level = &texture.levels[0];
+        let n = level.texels.len() as f32;
+        let mean = level.texels.iter().map(|t| f32::from(t[1])).sum::<f32>() / n;
+        let read = texture.sample(0.5, 0.5, [1.0, 0.0], [0.0, 1.0])[1];
+        assert!((read - mean).abs() < 6.0, "{read} against {mean}");
+    }
+
+    #[test]
+    fn a_small_footprint_reads_the_texel() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let texture = paint(Material::Carton, 0.5, 0.4, 1.0, &mut rng);
+        let level = &texture.levels[0];
+        let (column, row) = (37, 21);
+        let (u, v) = ((column as f32 + 0.5) * texture.texel, (row as f32 + 0.5) * texture.texel);
+        let read = texture.sample(u, v, [1e-4, 0.0], [0.0, 1e-4]);
+        let texel = level.texels[row * level.width + column];
+        assert!((read[0] - f32::from(texel[0])).abs() < 0.5);
+    }
+
+    #[test]
+    fn every_material_has_contrast() {
+        for material in [
+            Material::Wall,
+            Material::Ceiling,
+            Material::Floor,
+            Material::Carton,
+            Material::Wood,
+            Material::Books,
+            Material::Print,
+        ] {
+            let mut rng = ChaCha8Rng::seed_from_u64(9);
+            let texture = paint(material, 0.9, 0.7, 1.0, &mut rng);
+            let level = &texture.levels[0];
+            let n = level.texels.len() as f32;
+            let values = || level.texels.iter().map(|t| f32::from(t[1]));
+            let mean = values().sum::<f32>() / n;
+            let sd = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt();
+            assert!(sd > 8.0, "{material:?}: {sd}");
+        }
+    }
+}
