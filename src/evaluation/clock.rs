@@ -1,0 +1,223 @@
+use nalgebra::{Isometry3, UnitQuaternion};
+
+use super::{EvaluationError, Trajectory};
+
+/// How far the clock of an estimate is from that of the reference.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ClockOffset {
+    /// To be added to the stamps of the estimate, s.
+    pub seconds: f64,
+    /// Correlation of the angular speeds at this offset, at most 1.
+    pub correlation: f64,
+    /// Correlation at the offset the search started from; NaN where there is no overlap.
+    pub correlation_at_start: f64,
+}
+
+/// Angular speeds are taken over this time: long enough to quieten the noise of a motion capture
+/// system, short enough to keep what people and robots do, s.
+const WINDOW: f64 = 0.1;
+/// Attitudes are not interpolated across longer intervals, s.
+const MAX_GAP: f64 = 0.25;
+/// Samples of the estimate that are compared.
+const SAMPLES: usize = 4000;
+/// An offset is considered where at least this fraction of the samples meets the reference.
+const MIN_OVERLAP: f64 = 0.3;
+/// Steps of the coarse and the fine search, s.
+const COARSE: f64 = 0.05;
+const FINE: f64 = 0.005;
+/// Without a clear maximum within this time the search goes on over all offsets, s.
+const NEAR: f64 = 1.0;
+/// A correlation that is clear.
+const CLEAR: f64 = 0.8;
+/// Less than this is no correlation at all.
+const NONE: f64 = 0.4;
+
+/// Finds the clock offset by cross-correlating angular speeds, which do not depend on the choice
+/// of the world or of the frame on the body.
+///
+/// Looks within 1 s of no offset, then, if nothing there is clear, over every offset at which the
+/// trajectories overlap enough.
+pub fn estimate_clock_offset(
+    reference: &Trajectory,
+    estimate: &Trajectory,
+) -> Result<ClockOffset, EvaluationError> {
+    let signals = Signals::of(reference, estimate);
+    let near = signals.search(0.0, -NEAR, NEAR);
+    let clear = near.filter(|offset| offset.correlation >= CLEAR);
+    let found = clear.or_else(|| {
+        let ([r0, r1], [e0, e1]) = (reference.range(), estimate.range());
+        let far = signals.search(0.0, r0 - e1, r1 - e0);
+        far.into_iter().chain(near).max_by(|a, b| a.correlation.total_cmp(&b.correlation))
+    });
+    found.filter(|offset| offset.correlation >= NONE).ok_or(EvaluationError::NoClockOffset {
+        correlation: found.map_or(0.0, |offset| offset.correlation),
+    })
+}
+
+/// The best offset within a second of `start`, `None` where the angular speeds tell nothing.
+pub(super) fn nearby_clock_offset(
+    reference: &Trajectory,
+    estimate: &Trajectory,
+    start: f64,
+) -> Option<ClockOffset> {
+    Signals::of(reference, estimate).search(start, start - NEAR, start + NEAR)
+}
+
+/// Angular speed over time, rad/s.
+struct Signal {
+    stamps: Vec<f64>,
+    speeds: Vec<f64>,
+}
+
+struct Signals {
+    reference: Signal,
+    estimate: Signal,
+}
+
+impl Signals {
+    fn of(reference: &Trajectory, estimate: &Trajectory) -> Self {
+        let stride = estimate.len().div_ceil(SAMPLES);
+        Self { reference: Signal::of(reference, 1), estimate: Signal::of(estimate, stride) }
+    }
+
+    /// The offset between `from` and `to` (s) where the correlation is largest.
+    fn search(&self, start: f64, from: f64, to: f64) -> Option<ClockOffset> {
+        let best = |from: f64, to: f64, step: f64| {
+            let count = ((to - from) / step).ceil() as usize;
+            (0..=count)
+                .map(|k| from + k as f64 * step)
+                .filter_map(|offset| Some((offset, self.correlation(offset)?)))
+                .max_by(|a, b| a.1.total_cmp(&b.1))
+        };
+        let (coarse, _) = best(from, to, COARSE)?;
+        let (fine, correlation) = best(coarse - COARSE, coarse + COARSE, FINE)?;
+        let around = (self.correlation(fine - FINE), self.correlation(fine + FINE));
+        let seconds = match around {
+            (Some(before), Some(after)) => fine + FINE * vertex(before, correlation, after),
+            _ => fine,
+        };
+        let correlation_at_start = self.correlation(start).unwrap_or(f64::NAN);
+        Some(ClockOffset { seconds, correlation, correlation_at_start })
+    }
+
+    /// Pearson's correlation of the estimate's speeds and the reference's `offset` later; `None`
+    /// where too few samples meet or nothing turns.
+    fn correlation(&self, offset: f64) -> Option<f64> {
+        let mut sums = [0.0; 5];
+        let mut n = 0;
+        let mut cursor = 0;
+        for (stamp, e) in self.estimate.stamps.iter().zip(&self.estimate.speeds) {
+            if let Some(r) = self.reference.at(stamp + offset, &mut cursor) {
+                for (sum, term) in sums.iter_mut().zip([*e, r, e * e, r * r, e * r]) {
+                    *sum += term;
+                }
+                n += 1;
+            }
+        }
+        if n < 10 || (n as f64) < MIN_OVERLAP * self.estimate.stamps.len() as f64 {
+            return None;
+        }
+        let [e, r, ee, rr, er] = sums.map(|sum| sum / n as f64);
+        let variance = (ee - e * e) * (rr - r * r);
+        (variance > 0.0).then(|| (er - e * r) / variance.sqrt())
+    }
+}
+
+/// Where between -1 and 1 the parabola through three equidistant values has its vertex.
+fn vertex(before: f64, middle: f64, after: f64) -> f64 {
+    let curvature = before - 2.0 * middle + after;
+    if curvature < 0.0 { (0.5 * (before - after) / curvature).clamp(-1.0, 1.0) } else { 0.0 }
+}
+
+impl Signal {
+    /// The angular speed at every `stride`-th pose of which both ends of the window are known.
+    fn of(trajectory: &Trajectory, stride: usize) -> Self {
+        let (mut early, mut late) = (0, 0);
+        let (stamps, speeds) = trajectory
+            .stamps()
+            .iter()
+            .step_by(stride)
+            .filter_map(|&stamp| {
+                let start = attitude_at(trajectory, stamp - WINDOW / 2.0, &mut early)?;
+                let end = attitude_at(trajectory, stamp + WINDOW / 2.0, &mut late)?;
+                Some((stamp, start.angle_to(&end) / WINDOW))
+            })
+            .unzip();
+        Self { stamps, speeds }
+    }
+
+    /// Linear between samples; `cursor` moves forward only as long as `stamp` does.
+    fn at(&self, stamp: f64, cursor: &mut usize) -> Option<f64> {
+        let (i, fraction) = bracket(&self.stamps, stamp, cursor)?;
+        Some(self.speeds[i] + (self.speeds[i + 1] - self.speeds[i]) * fraction)
+    }
+}
+
+fn attitude_at(
+    trajectory: &Trajectory,
+    stamp: f64,
+    cursor: &mut usize,
+) -> Option<UnitQuaternion<f64>> {
+    let (i, fraction) = bracket(trajectory.stamps(), stamp, cursor)?;
+    let [a, b]: &[Isometry3<f64>; 2] = trajectory.poses().get(i..i + 2)?.try_into().ok()?;
+    let step = a.rotation.rotation_to(&b.rotation);
+    Some(step.powf(fraction) * a.rotation)
+}
+
+/// Index `i` and fraction such that `stamp` is that far from `stamps[i]` to `stamps[i + 1]`;
+/// `None` outside and in gaps.
+fn bracket(stamps: &[f64], stamp: f64, cursor: &mut usize) -> Option<(usize, f64)> {
+    while stamps.get(*cursor + 1).is_some_and(|next| *next < stamp) {
+        *cursor += 1;
+    }
+    let (from, to) = (stamps.get(*cursor)?, stamps.get(*cursor + 1)?);
+    let interval = to - from;
+    let inside = *from <= stamp && stamp <= *to && interval > 0.0 && interval <= MAX_GAP;
+    inside.then(|| (*cursor, (stamp - from) / interval))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::vector;
+    use proptest::prelude::*;
+
+    fn trajectory(rate: f64, duration: f64, clock: f64, start: f64) -> Trajectory {
+        let count = (duration * rate) as usize;
+        let (stamps, poses) = (0..count)
+            .map(|i| {
+                let t = start + i as f64 / rate;
+                let turn = vector![
+                    (1.1 * t).sin() + (0.13 * t * t).cos(),
+                    0.8 * (1.7 * t).cos(),
+                    0.5 * t.sin()
+                ];
+                (t + clock, Isometry3::new(vector![t, 0.0, 0.0], turn))
+            })
+            .unzip();
+        Trajectory::new(stamps, poses).unwrap()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(16))]
+        #[test]
+        fn an_offset_is_found_near_and_far(near in -0.9..0.9_f64, far in -5e3..5e3_f64) {
+            let reference = trajectory(100.0, 30.0, 0.0, 0.0);
+            for clock in [near, far] {
+                let estimate = trajectory(20.0, 20.0, clock, 5.0);
+                let found = estimate_clock_offset(&reference, &estimate).unwrap();
+                prop_assert!((found.seconds + clock).abs() < 2e-3, "{:?} {}", found, clock);
+                prop_assert!(found.correlation > 0.95);
+            }
+        }
+    }
+
+    #[test]
+    fn without_rotation_there_is_nothing_to_find() {
+        let stamps: Vec<f64> = (0..100).map(|i| f64::from(i) * 0.05).collect();
+        let poses = stamps.iter().map(|t| Isometry3::translation(*t, 0.0, 0.0)).collect();
+        let still = Trajectory::new(stamps, poses).unwrap();
+        let error = estimate_clock_offset(&trajectory(100.0, 5.0, 0.0, 0.0), &still).unwrap_err();
+        assert!(matches!(error, EvaluationError::NoClockOffset { .. }));
+    }
+}

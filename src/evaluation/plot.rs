@@ -1,0 +1,522 @@
+//! Plots as values: panels of curves, coloured paths and boxes, drawn to SVG or PNG.
+//!
+//! The only part of the module that mentions `plotters`.
+
+use std::path::{Path, PathBuf};
+use std::sync::Once;
+
+use plotters::coord::Shift;
+use plotters::coord::types::RangedCoordf64;
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+
+use super::statistics::quantile;
+
+/// A picture of several panels.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Figure {
+    pub title: String,
+    pub panels: Vec<Panel>,
+    /// Panels side by side.
+    pub columns: usize,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub enum Panel {
+    Path(PathPanel),
+    Curves(CurvePanel),
+    Boxes(BoxPanel),
+}
+
+/// Two paths in a plane, in equal scales; the second one coloured by a value.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PathPanel {
+    pub title: String,
+    pub x_label: String,
+    pub y_label: String,
+    /// NaN interrupts the line.
+    pub reference: Vec<[f64; 2]>,
+    pub estimate: Vec<[f64; 2]>,
+    /// One for each point of `estimate`.
+    pub values: Vec<f64>,
+    pub value_label: String,
+}
+
+/// Curves over a common axis.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct CurvePanel {
+    pub title: String,
+    pub x_label: String,
+    pub y_label: String,
+    /// Shaded below the curves.
+    pub bands: Vec<Band>,
+    pub curves: Vec<Curve>,
+    /// Largest value shown, where the curves go far beyond what is of interest.
+    pub y_max: Option<f64>,
+}
+
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Curve {
+    pub name: String,
+    /// NaN interrupts the line.
+    pub points: Vec<[f64; 2]>,
+}
+
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Band {
+    pub name: String,
+    /// `[x, low, high]`; NaN interrupts the band.
+    pub points: Vec<[f64; 3]>,
+}
+
+/// Distributions side by side: median, quartiles, 5 % and 95 % quantiles.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct BoxPanel {
+    pub title: String,
+    pub x_label: String,
+    pub y_label: String,
+    pub groups: Vec<(String, Vec<f64>)>,
+}
+
+/// Why a figure could not be drawn or saved.
+#[derive(Debug, thiserror::Error)]
+pub enum PlotError {
+    #[error("{path}: a plot is saved as .svg or .png")]
+    Extension { path: PathBuf },
+    #[error("{path}: {source}")]
+    Io { path: PathBuf, source: std::io::Error },
+    #[error("drawing failed: {0}")]
+    Drawing(String),
+}
+
+/// Size of a panel, pixels of the SVG.
+const PANEL: (u32, u32) = (640, 400);
+/// Height of the line for the figure's title.
+const TITLE: u32 = 34;
+/// Pixels of a PNG per pixel of the SVG.
+const PNG_SCALE: u32 = 2;
+/// More points than this a line cannot be told apart.
+const MAX_POINTS: usize = 4000;
+const FONT: &str = "sans-serif";
+/// Colours that stay apart for the colour-blind (Okabe and Ito).
+const COLORS: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(230, 159, 0),
+    RGBColor(86, 180, 233),
+    RGBColor(60, 60, 60),
+];
+const REFERENCE: RGBColor = RGBColor(130, 130, 130);
+const GRID: RGBColor = RGBColor(225, 225, 225);
+
+/// The colour map viridis (van der Walt and Smith), linear between nine of its colours; `fraction`
+/// from 0 (dark blue) to 1 (yellow).
+fn viridis(fraction: f64) -> RGBColor {
+    const ANCHORS: [[u8; 3]; 9] = [
+        [68, 1, 84],
+        [71, 44, 122],
+        [59, 81, 139],
+        [44, 113, 142],
+        [33, 144, 141],
+        [39, 173, 129],
+        [92, 200, 99],
+        [170, 220, 50],
+        [253, 231, 37],
+    ];
+    let position = fraction.clamp(0.0, 1.0) * (ANCHORS.len() - 1) as f64;
+    let low = (position.floor() as usize).min(ANCHORS.len() - 2);
+    let channel = |k: usize| {
+        let (a, b) = (f64::from(ANCHORS[low][k]), f64::from(ANCHORS[low + 1][k]));
+        (a + (b - a) * (position - low as f64)).round() as u8
+    };
+    RGBColor(channel(0), channel(1), channel(2))
+}
+
+impl Figure {
+    /// The same figure with `name` before its title.
+    pub fn titled(mut self, name: &str) -> Self {
+        self.title = format!("{name}: {}", self.title);
+        self
+    }
+
+    /// Width and height, pixels.
+    fn size(&self) -> (u32, u32) {
+        let columns = self.columns.clamp(1, self.panels.len().max(1)) as u32;
+        let rows = (self.panels.len() as u32).div_ceil(columns);
+        (columns * PANEL.0, rows * PANEL.1 + TITLE)
+    }
+
+    /// The figure as an SVG document.
+    pub fn to_svg(&self) -> Result<String, PlotError> {
+        let mut svg = String::new();
+        let root = SVGBackend::with_string(&mut svg, self.size()).into_drawing_area();
+        self.draw(&root, 1)?;
+        drop(root);
+        Ok(svg)
+    }
+
+    /// Saves as SVG or PNG, by the extension of `path`.
+    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
+        match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+            Some("svg") => std::fs::write(path, self.to_svg()?)
+                .map_err(|source| PlotError::Io { path: path.to_owned(), source }),
+            Some("png") => {
+                let (width, height) = self.size();
+                let size = (width * PNG_SCALE, height * PNG_SCALE);
+                let root = BitMapBackend::new(path, size).into_drawing_area();
+                self.draw(&root, PNG_SCALE)
+            }
+            _ => Err(PlotError::Extension { path: path.to_owned() }),
+        }
+    }
+
+    fn draw<DB: DrawingBackend>(
+        &self,
+        root: &DrawingArea<DB, Shift>,
+        scale: u32,
+    ) -> Result<(), PlotError> {
+        register_font();
+        let canvas = Canvas { scale };
+        root.fill(&WHITE).map_err(drawing)?;
+        let (title, body) = root.split_vertically(TITLE * scale);
+        let style = canvas.text(17).pos(Pos::new(HPos::Center, VPos::Center));
+        let (width, height) = title.dim_in_pixel();
+        title
+            .draw(&Text::new(self.title.as_str(), (width as i32 / 2, height as i32 / 2), style))
+            .map_err(drawing)?;
+        let columns = self.columns.clamp(1, self.panels.len().max(1));
+        let areas = body.split_evenly((self.panels.len().div_ceil(columns), columns));
+        for (panel, area) in self.panels.iter().zip(&areas) {
+            match panel {
+                Panel::Path(panel) => canvas.path(panel, area)?,
+                Panel::Curves(panel) => canvas.curves(panel, area)?,
+                Panel::Boxes(panel) => canvas.boxes(panel, area)?,
+            }
+        }
+        root.present().map_err(drawing)
+    }
+}
+
+fn drawing<E: std::error::Error + Send + Sync>(error: DrawingAreaErrorKind<E>) -> PlotError {
+    PlotError::Drawing(error.to_string())
+}
+
+/// Without a font no size of a text is known, not even for SVG.
+fn register_font() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        // Fails for broken font data only; then drawing says that the font is unavailable.
+        let _ = plotters::style::register_font(FONT, FontStyle::Normal, dejavu::sans::regular());
+    });
+}
+
+/// Sizes in pixels of the SVG, whatever is drawn on.
+#[derive(Clone, Copy)]
+struct Canvas {
+    scale: u32,
+}
+
+type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+
+/// Margins around the axes: top, right, bottom (labels), left (labels).
+const MARGINS: [u32; 4] = [34, 20, 46, 68];
+const COLOR_BAR: u32 = 84;
+
+impl Canvas {
+    fn px(self, length: u32) -> u32 {
+        length * self.scale
+    }
+
+    fn text(self, size: u32) -> TextStyle<'static> {
+        (FONT, self.px(size)).into_font().color(&BLACK)
+    }
+
+    fn line(self, color: impl Color, width: u32) -> ShapeStyle {
+        color.to_rgba().stroke_width(self.px(width))
+    }
+
+    /// Axes with grid and labels.
+    fn chart<'a, DB: DrawingBackend + 'a>(
+        self,
+        area: &DrawingArea<DB, Shift>,
+        title: &str,
+        labels: [&str; 2],
+        ranges: [[f64; 2]; 2],
+        x_names: Option<&dyn Fn(&f64) -> String>,
+    ) -> Result<Chart<'a, DB>, PlotError> {
+        let [top, right, bottom, left] = MARGINS.map(|margin| self.px(margin));
+        let (width, _) = area.dim_in_pixel();
+        let style = self.text(14).pos(Pos::new(HPos::Center, VPos::Center));
+        let position = ((left + width.saturating_sub(right)) as i32 / 2, self.px(18) as i32);
+        area.draw(&Text::new(title.to_owned(), position, style)).map_err(drawing)?;
+        let [x, y] = ranges;
+        let mut chart = ChartBuilder::on(area)
+            .margin_top(top)
+            .margin_right(right)
+            .x_label_area_size(bottom)
+            .y_label_area_size(left)
+            .build_cartesian_2d(x[0]..x[1], y[0]..y[1])
+            .map_err(drawing)?;
+        let (x_ticks, y_ticks) = (ticks(x), ticks(y));
+        let x_names: &dyn Fn(&f64) -> String = match x_names {
+            Some(names) => names,
+            None => &x_ticks,
+        };
+        chart
+            .configure_mesh()
+            .light_line_style(TRANSPARENT)
+            .bold_line_style(self.line(GRID, 1))
+            .axis_style(self.line(BLACK, 1))
+            .label_style(self.text(12))
+            .axis_desc_style(self.text(13))
+            .x_labels(8)
+            .y_labels(7)
+            .x_desc(labels[0])
+            .y_desc(labels[1])
+            .x_label_formatter(x_names)
+            .y_label_formatter(&y_ticks)
+            .draw()
+            .map_err(drawing)?;
+        Ok(chart)
+    }
+
+    fn legend<'a, DB: DrawingBackend + 'a>(
+        self,
+        chart: &mut Chart<'a, DB>,
+    ) -> Result<(), PlotError> {
+        chart
+            .configure_series_labels()
+            .position(SeriesLabelPosition::UpperRight)
+            .background_style(WHITE.mix(0.85))
+            .border_style(self.line(GRID, 1))
+            .legend_area_size(self.px(24))
+            .margin(self.px(6))
+            .label_font(self.text(12))
+            .draw()
+            .map_err(drawing)
+    }
+
+    fn path<DB: DrawingBackend>(
+        self,
+        panel: &PathPanel,
+        area: &DrawingArea<DB, Shift>,
+    ) -> Result<(), PlotError> {
+        let (width, height) = area.dim_in_pixel();
+        let (left, right) = area.split_horizontally(width.saturating_sub(self.px(COLOR_BAR)));
+        let [top, margin_right, bottom, margin_left] = MARGINS.map(|margin| self.px(margin));
+        let inner = [
+            width.saturating_sub(self.px(COLOR_BAR) + margin_left + margin_right).max(1),
+            height.saturating_sub(top + bottom).max(1),
+        ];
+        let points = || panel.reference.iter().chain(&panel.estimate);
+        let ranges = equal_scales([0, 1].map(|k| extent(points().map(|p| p[k]))), inner);
+        let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
+        let mut chart = self.chart(&left, &panel.title, labels, ranges, None)?;
+        for run in runs(&panel.reference) {
+            let points = thinned(run).map(|p| (p[0], p[1]));
+            chart.draw_series(LineSeries::new(points, self.line(REFERENCE, 1))).map_err(drawing)?;
+        }
+        let [low, high] = extent(panel.values.iter().copied());
+        let stride = panel.estimate.len().div_ceil(MAX_POINTS).max(1);
+        let kept: Vec<usize> = (0..panel.estimate.len()).step_by(stride).collect();
+        let segments = kept.windows(2).filter_map(|w| {
+            let (a, b) = (panel.estimate.get(w[0])?, panel.estimate.get(w[1])?);
+            let value = panel.values.get(w[1])?;
+            let unbroken = panel.estimate.get(w[0]..=w[1])?.iter().all(is_finite);
+            let color = viridis((value - low) / (high - low));
+            let style = self.line(color, 2);
+            unbroken.then(|| PathElement::new(vec![(a[0], a[1]), (b[0], b[1])], style))
+        });
+        chart.draw_series(segments).map_err(drawing)?;
+        self.color_bar(&right, [low, high], &panel.value_label)
+    }
+
+    fn color_bar<DB: DrawingBackend>(
+        self,
+        area: &DrawingArea<DB, Shift>,
+        [low, high]: [f64; 2],
+        label: &str,
+    ) -> Result<(), PlotError> {
+        const STEPS: i32 = 100;
+        let (_, height) = area.dim_in_pixel();
+        let (top, bottom) = (self.px(MARGINS[0]) as i32, (height - self.px(MARGINS[2])) as i32);
+        let (left, right) = (self.px(4) as i32, self.px(18) as i32);
+        let at = |step: i32| bottom + (top - bottom) * step / STEPS;
+        for step in 0..STEPS {
+            let color = viridis(f64::from(step) / f64::from(STEPS - 1));
+            let corners = [(left, at(step + 1)), (right, at(step))];
+            area.draw(&Rectangle::new(corners, color.filled())).map_err(drawing)?;
+        }
+        let format = ticks([low, high]);
+        let style = self.text(12).pos(Pos::new(HPos::Left, VPos::Center));
+        for quarter in 0..=4 {
+            let value = low + (high - low) * f64::from(quarter) / 4.0;
+            let position = (right + self.px(4) as i32, at(quarter * STEPS / 4));
+            area.draw(&Text::new(format(&value), position, style.clone())).map_err(drawing)?;
+        }
+        let style = self.text(12).pos(Pos::new(HPos::Left, VPos::Center));
+        area.draw(&Text::new(label.to_owned(), (left, self.px(18) as i32), style)).map_err(drawing)
+    }
+
+    fn curves<DB: DrawingBackend>(
+        self,
+        panel: &CurvePanel,
+        area: &DrawingArea<DB, Shift>,
+    ) -> Result<(), PlotError> {
+        let band_points = || panel.bands.iter().flat_map(|band| &band.points);
+        let curve_points = || panel.curves.iter().flat_map(|curve| &curve.points);
+        let x = band_points().map(|p| p[0]).chain(curve_points().map(|p| p[0]));
+        let y = band_points().flat_map(|p| [p[1], p[2]]).chain(curve_points().map(|p| p[1]));
+        let y_max = panel.y_max.unwrap_or(f64::INFINITY);
+        let ranges = [extent(x), padded(extent(y.map(|value| value.min(y_max))))];
+        let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
+        let mut chart = self.chart(area, &panel.title, labels, ranges, None)?;
+        let mut names = 0;
+        for (band, color) in panel.bands.iter().zip(COLORS.iter().cycle()) {
+            let color = color.mix(0.18);
+            for (k, run) in runs(&band.points).enumerate() {
+                let upper = thinned(run).map(|p| (p[0], p[2].min(y_max)));
+                let lower: Vec<_> = thinned(run).map(|p| (p[0], p[1].min(y_max))).collect();
+                let outline: Vec<_> = upper.chain(lower.into_iter().rev()).collect();
+                let shape = std::iter::once(Polygon::new(outline, color.filled()));
+                let series = chart.draw_series(shape).map_err(drawing)?;
+                if k == 0 && !band.name.is_empty() {
+                    let size = self.px(16) as i32;
+                    names += 1;
+                    series.label(band.name.as_str()).legend(move |(x, y)| {
+                        let half = size / 4;
+                        Rectangle::new([(x, y - half), (x + size, y + half)], color.filled())
+                    });
+                }
+            }
+        }
+        for (curve, color) in panel.curves.iter().zip(COLORS.iter().cycle()) {
+            let style = self.line(*color, 1);
+            for (k, run) in runs(&curve.points).enumerate() {
+                let points = thinned(run).map(|p| (p[0], p[1].min(y_max)));
+                let series = chart.draw_series(LineSeries::new(points, style)).map_err(drawing)?;
+                if k == 0 && !curve.name.is_empty() {
+                    let size = self.px(16) as i32;
+                    names += 1;
+                    series
+                        .label(curve.name.as_str())
+                        .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + size, y)], style));
+                }
+            }
+        }
+        if names > 1 { self.legend(&mut chart) } else { Ok(()) }
+    }
+
+    fn boxes<DB: DrawingBackend>(
+        self,
+        panel: &BoxPanel,
+        area: &DrawingArea<DB, Shift>,
+    ) -> Result<(), PlotError> {
+        let quantiles: Vec<[f64; 5]> = panel
+            .groups
+            .iter()
+            .map(|(_, values)| {
+                let mut sorted = values.clone();
+                sorted.sort_unstable_by(f64::total_cmp);
+                [0.05, 0.25, 0.5, 0.75, 0.95].map(|p| quantile(&sorted, p))
+            })
+            .collect();
+        let highest = extent(quantiles.iter().flatten().copied().chain([0.0]));
+        let count = panel.groups.len().max(1) as f64;
+        let names = |x: &f64| {
+            let index = (x - 0.5).round();
+            let on_group = (x - 0.5 - index).abs() < 1e-6 && index >= 0.0;
+            let group = on_group.then(|| panel.groups.get(index as usize)).flatten();
+            group.map_or_else(String::new, |(name, _)| name.clone())
+        };
+        let ranges = [[0.0, count], padded(highest)];
+        let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
+        let mut chart = self.chart(area, &panel.title, labels, ranges, Some(&names))?;
+        let color = COLORS[0];
+        for (index, [low, first, median, third, high]) in quantiles.into_iter().enumerate() {
+            if !median.is_finite() {
+                continue;
+            }
+            let x = index as f64 + 0.5;
+            let style = self.line(color, 1);
+            let line = |from: (f64, f64), to| PathElement::new(vec![from, to], style);
+            let whiskers = [
+                line((x, low), (x, first)),
+                line((x, third), (x, high)),
+                line((x - 0.1, low), (x + 0.1, low)),
+                line((x - 0.1, high), (x + 0.1, high)),
+            ];
+            let corners = [(x - 0.25, first), (x + 0.25, third)];
+            let fill = Rectangle::new(corners, color.mix(0.25).filled());
+            let frame = Rectangle::new(corners, style);
+            chart.draw_series(whiskers).map_err(drawing)?;
+            chart.draw_series([fill, frame]).map_err(drawing)?;
+            let middle = PathElement::new(
+                vec![(x - 0.25, median), (x + 0.25, median)],
+                self.line(COLORS[1], 2),
+            );
+            chart.draw_series([middle]).map_err(drawing)?;
+        }
+        Ok(())
+    }
+}
+
+fn is_finite<const N: usize>(point: &[f64; N]) -> bool {
+    point.iter().all(|x| x.is_finite())
+}
+
+/// The parts between NaN.
+fn runs<const N: usize>(points: &[[f64; N]]) -> impl Iterator<Item = &[[f64; N]]> {
+    points.split(|point| !is_finite(point)).filter(|run| !run.is_empty())
+}
+
+/// At most [`MAX_POINTS`] points, the last one among them.
+fn thinned<const N: usize>(run: &[[f64; N]]) -> impl Iterator<Item = &[f64; N]> {
+    let stride = run.len().div_ceil(MAX_POINTS).max(1);
+    let last = run.last().filter(|_| !(run.len() - 1).is_multiple_of(stride));
+    run.iter().step_by(stride).chain(last)
+}
+
+/// Smallest and largest finite value, apart from each other.
+fn extent(values: impl Iterator<Item = f64>) -> [f64; 2] {
+    let [low, high] = values
+        .filter(|value| value.is_finite())
+        .fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], x| [low.min(x), high.max(x)]);
+    let least = 1e-9 * low.abs().max(high.abs()).max(1e-3);
+    match high - low {
+        spread if spread > least => [low, high],
+        spread if spread >= 0.0 => [low - least, high + least],
+        _ => [0.0, 1.0],
+    }
+}
+
+/// With room above and, unless the range starts at zero, below.
+fn padded([low, high]: [f64; 2]) -> [f64; 2] {
+    let room = 0.05 * (high - low);
+    let low = if (0.0..room).contains(&low) { 0.0 } else { low - room };
+    [low, high + room]
+}
+
+/// Widens one of two ranges so that a metre is as long on both axes of `pixels`.
+fn equal_scales(ranges: [[f64; 2]; 2], pixels: [u32; 2]) -> [[f64; 2]; 2] {
+    let per_pixel = |k: usize| (ranges[k][1] - ranges[k][0]) / f64::from(pixels[k]);
+    let scale = 1.08 * per_pixel(0).max(per_pixel(1));
+    [0, 1].map(|k| {
+        let middle = 0.5 * (ranges[k][0] + ranges[k][1]);
+        let half = 0.5 * scale * f64::from(pixels[k]);
+        [middle - half, middle + half]
+    })
+}
+
+/// Writes numbers with as many decimals as ticks on `range` need.
+fn ticks(range: [f64; 2]) -> impl Fn(&f64) -> String {
+    let spread = (range[1] - range[0]).abs().max(f64::MIN_POSITIVE);
+    let decimals = (1.3 - spread.log10()).ceil().clamp(0.0, 9.0) as usize;
+    let tiny = 1e-9 * spread;
+    move |value| {
+        let value = if value.abs() < tiny { 0.0 } else { *value };
+        format!("{value:.decimals$}")
+    }
+}
