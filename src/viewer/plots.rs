@@ -1,0 +1,265 @@
+//! Time series: what is plotted, under which names and colors, and in which tab it appears.
+
+use nalgebra::{Isometry3, Vector3};
+use rerun::{RecordingStream, RecordingStreamResult, Scalars, SeriesLines};
+
+use super::covariance::{principal_axes, standard_deviations};
+use super::timeline::Clock;
+use crate::inertial::ImuSample;
+use crate::inertial::block;
+use crate::odometry::StepReport;
+
+/// One plot: an entity whose every row holds one number a series.
+pub(super) struct Plot {
+    pub(super) entity: &'static str,
+    pub(super) title: &'static str,
+    series: &'static [Series],
+}
+
+struct Series {
+    name: &'static str,
+    color: [u8; 4],
+    /// Points of the user interface.
+    width: f32,
+}
+
+const fn line(name: &'static str, [r, g, b]: [u8; 3]) -> Series {
+    Series { name, color: [r, g, b, 255], width: 1.5 }
+}
+
+/// A bound or a reference: thinner and fainter than the line it belongs to.
+const fn bound(name: &'static str, [r, g, b]: [u8; 3]) -> Series {
+    Series { name, color: [r, g, b, 110], width: 1.0 }
+}
+
+const X: [u8; 3] = [240, 90, 90];
+const Y: [u8; 3] = [110, 210, 100];
+const Z: [u8; 3] = [90, 150, 255];
+const BLUE: [u8; 3] = [90, 170, 255];
+const ORANGE: [u8; 3] = [255, 160, 60];
+const YELLOW: [u8; 3] = [240, 220, 90];
+const GREEN: [u8; 3] = [100, 220, 120];
+const RED: [u8; 3] = [240, 80, 80];
+const VIOLET: [u8; 3] = [190, 130, 255];
+const CYAN: [u8; 3] = [90, 220, 220];
+const GREY: [u8; 3] = [170, 170, 170];
+
+const AXES: &[Series] = &[line("x", X), line("y", Y), line("z", Z)];
+const AXES_WITH_BANDS: &[Series] = &[
+    line("x", X),
+    line("y", Y),
+    line("z", Z),
+    bound("x ± 3σ", X),
+    bound("x ± 3σ", X),
+    bound("y ± 3σ", Y),
+    bound("y ± 3σ", Y),
+    bound("z ± 3σ", Z),
+    bound("z ± 3σ", Z),
+];
+const ERROR_AND_BOUND: &[Series] = &[line("error", ORANGE), bound("largest 3σ", GREY)];
+
+const POSITION_ERROR: Plot =
+    Plot { entity: "plots/error/position", title: "Position error [m]", series: ERROR_AND_BOUND };
+const ATTITUDE_ERROR: Plot =
+    Plot { entity: "plots/error/attitude", title: "Attitude error [deg]", series: ERROR_AND_BOUND };
+const POSITION_SIGMA: Plot =
+    Plot { entity: "plots/sigma/position", title: "Position σ, world [m]", series: AXES };
+const ATTITUDE_SIGMA: Plot =
+    Plot { entity: "plots/sigma/attitude", title: "Attitude σ, body [deg]", series: AXES };
+const VELOCITY_SIGMA: Plot =
+    Plot { entity: "plots/sigma/velocity", title: "Velocity σ, world [m/s]", series: AXES };
+const MATRIX_FISHER_S: Plot = Plot {
+    entity: "plots/matrix_fisher/s",
+    title: "Matrix Fisher S: sign(s) log10(1 + |s|)",
+    series: &[line("s1", X), line("s2", Y), line("s3", Z)],
+};
+const INNOVATION: Plot = Plot {
+    entity: "plots/innovation",
+    title: "Squared innovation a degree of freedom",
+    series: &[line("innovation", BLUE), bound("consistent", GREY)],
+};
+const FEATURES: Plot = Plot {
+    entity: "plots/counts/features",
+    title: "Key points and map points of a frame",
+    series: &[
+        line("features", GREY),
+        line("with depth", YELLOW),
+        line("candidates", VIOLET),
+        line("matches", BLUE),
+        line("inliers", GREEN),
+        line("new", CYAN),
+    ],
+};
+const MAP_SIZE: Plot = Plot {
+    entity: "plots/counts/map",
+    title: "Points in the map",
+    series: &[line("map points", VIOLET)],
+};
+const VELOCITY: Plot =
+    Plot { entity: "plots/velocity", title: "Velocity, world [m/s]", series: AXES };
+const GYRO_BIAS: Plot =
+    Plot { entity: "plots/bias/gyro", title: "Gyroscope bias [deg/s]", series: AXES_WITH_BANDS };
+const ACCEL_BIAS: Plot = Plot {
+    entity: "plots/bias/accel",
+    title: "Accelerometer bias [m/s²]",
+    series: AXES_WITH_BANDS,
+};
+const TIMING: Plot = Plot {
+    entity: "plots/timing",
+    title: "Processing time of a frame [ms]",
+    series: &[
+        line("features", YELLOW),
+        line("propagation", CYAN),
+        line("matching", VIOLET),
+        line("ransac", GREEN),
+        line("update", BLUE),
+        line("map", RED),
+        line("sum", GREY),
+    ],
+};
+const ANGULAR_VELOCITY: Plot =
+    Plot { entity: "plots/imu/gyro", title: "Gyroscope [deg/s]", series: AXES };
+const SPECIFIC_FORCE: Plot =
+    Plot { entity: "plots/imu/accel", title: "Accelerometer [m/s²]", series: AXES };
+
+/// Plots that stand side by side under one name.
+pub(super) struct Tab {
+    pub(super) name: &'static str,
+    pub(super) plots: &'static [Plot],
+}
+
+pub(super) const ERROR: Tab = Tab { name: "Error", plots: &[POSITION_ERROR, ATTITUDE_ERROR] };
+pub(super) const UNCERTAINTY: Tab =
+    Tab { name: "Uncertainty", plots: &[POSITION_SIGMA, ATTITUDE_SIGMA, VELOCITY_SIGMA] };
+pub(super) const BELIEF: Tab = Tab { name: "Belief", plots: &[MATRIX_FISHER_S, INNOVATION] };
+pub(super) const TRACKING: Tab = Tab { name: "Tracking", plots: &[FEATURES, MAP_SIZE] };
+pub(super) const STATE: Tab = Tab { name: "State", plots: &[VELOCITY, GYRO_BIAS, ACCEL_BIAS] };
+pub(super) const IMU: Tab = Tab { name: "IMU", plots: &[ANGULAR_VELOCITY, SPECIFIC_FORCE] };
+pub(super) const TIMES: Tab = Tab { name: "Timing", plots: &[TIMING] };
+
+const ALL: [Tab; 7] = [ERROR, UNCERTAINTY, BELIEF, TRACKING, STATE, IMU, TIMES];
+
+/// Names and colors, once for the whole recording.
+pub(super) fn log_styles(stream: &RecordingStream) -> RecordingStreamResult<()> {
+    for plot in ALL.iter().flat_map(|tab| tab.plots) {
+        let style = SeriesLines::new()
+            .with_names(plot.series.iter().map(|series| series.name))
+            .with_colors(plot.series.iter().map(|series| series.color))
+            .with_widths(plot.series.iter().map(|series| series.width));
+        stream.log_static(plot.entity, &style)?;
+    }
+    Ok(())
+}
+
+/// The numbers of one frame, at the stream's current time.
+pub(super) fn log_report(
+    stream: &RecordingStream,
+    report: &StepReport,
+    truth: Option<&Isometry3<f64>>,
+) -> RecordingStreamResult<()> {
+    let log = |plot: &Plot, values: &[f64]| {
+        debug_assert_eq!(plot.series.len(), values.len(), "{}", plot.entity);
+        stream.log(plot.entity, &Scalars::new(values.iter().copied()))
+    };
+    let sigma = |block| standard_deviations(&report.covariance, block);
+    let degrees = |radians: Vector3<f64>| radians.map(f64::to_degrees);
+
+    if let Some(truth) = truth {
+        let [position, attitude] = errors(report, truth);
+        log(&POSITION_ERROR, &position)?;
+        log(&ATTITUDE_ERROR, &attitude.map(f64::to_degrees))?;
+    }
+    log(&POSITION_SIGMA, sigma(block::POSITION).as_slice())?;
+    log(&ATTITUDE_SIGMA, degrees(sigma(block::ROTATION)).as_slice())?;
+    log(&VELOCITY_SIGMA, sigma(block::VELOCITY).as_slice())?;
+    if let Some(s) = report.matrix_fisher_s {
+        log(&MATRIX_FISHER_S, s.map(signed_log).as_slice())?;
+    }
+    if let Some(innovation) = report.innovation {
+        log(&INNOVATION, &[innovation, 1.0])?;
+    }
+    let counts = &report.counts;
+    let of_frame = [
+        counts.features,
+        counts.with_depth,
+        counts.candidates,
+        counts.matches,
+        counts.inliers,
+        counts.new_points,
+    ];
+    log(&FEATURES, &of_frame.map(|count| count as f64))?;
+    log(&MAP_SIZE, &[counts.map_points as f64])?;
+    log(&VELOCITY, report.state.velocity.as_slice())?;
+    let gyro_bias = degrees(report.state.gyro_bias);
+    log(&GYRO_BIAS, &with_bands(gyro_bias, degrees(sigma(block::GYRO_BIAS))))?;
+    log(&ACCEL_BIAS, &with_bands(report.state.accel_bias, sigma(block::ACCEL_BIAS)))?;
+    log(&TIMING, &stage_milliseconds(report))
+}
+
+/// IMU samples at their own stamps, in one batch.
+pub(super) fn log_imu(
+    stream: &RecordingStream,
+    clock: Clock,
+    samples: &[ImuSample],
+) -> RecordingStreamResult<()> {
+    let send = |plot: &Plot, reading: fn(&ImuSample) -> Vector3<f64>| {
+        let values = samples.iter().flat_map(|sample| <[f64; 3]>::from(reading(sample)));
+        let columns = Scalars::new(values).columns(vec![3; samples.len()])?;
+        let times = clock.column(samples.iter().map(|sample| sample.stamp));
+        stream.send_columns(plot.entity, [times], columns)
+    };
+    if samples.is_empty() {
+        return Ok(());
+    }
+    send(&ANGULAR_VELOCITY, |sample| sample.angular_velocity.map(f64::to_degrees))?;
+    send(&SPECIFIC_FORCE, |sample| sample.specific_force)
+}
+
+/// Error and largest 3 sigma of the position (m) and of the attitude (rad).
+fn errors(report: &StepReport, truth: &Isometry3<f64>) -> [[f64; 2]; 2] {
+    let estimate = &report.state.world_from_body;
+    let largest = |block| match principal_axes(&report.covariance, block) {
+        Some((deviations, _)) => 3.0 * deviations.max(),
+        None => f64::NAN,
+    };
+    let position = (estimate.translation.vector - truth.translation.vector).norm();
+    let attitude = estimate.rotation.angle_to(&truth.rotation);
+    [[position, largest(block::POSITION)], [attitude, largest(block::ROTATION)]]
+}
+
+/// `S` spans eight decades and has a sign; this shows all of it, zero at zero.
+fn signed_log(s: f64) -> f64 {
+    (1.0 + s.abs()).log10().copysign(s)
+}
+
+/// The order of [`AXES_WITH_BANDS`].
+fn with_bands(value: Vector3<f64>, sigma: Vector3<f64>) -> [f64; 9] {
+    let (low, high) = (value - 3.0 * sigma, value + 3.0 * sigma);
+    [value.x, value.y, value.z, low.x, high.x, low.y, high.y, low.z, high.z]
+}
+
+fn stage_milliseconds(report: &StepReport) -> [f64; 7] {
+    let [a, b, c, d, e, f] = report.times.stages().map(|(_, seconds)| 1e3 * seconds);
+    [a, b, c, d, e, f, a + b + c + d + e + f]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::odometry::StageTimes;
+
+    #[test]
+    fn stages_have_the_names_and_order_of_the_report() {
+        let names: Vec<_> = TIMING.series.iter().map(|series| series.name).collect();
+        let stages = StageTimes::default().stages().map(|(name, _)| name);
+        assert_eq!(names[..6], stages);
+    }
+
+    #[test]
+    fn the_logarithm_of_s_keeps_sign_and_order() {
+        let values = [-1e8, -3.0, -1e-9, 0.0, 1e-9, 3.0, 1e8].map(signed_log);
+        assert!(values.is_sorted());
+        assert_eq!(values[3], 0.0);
+        assert_eq!(values[0], -values[6]);
+    }
+}

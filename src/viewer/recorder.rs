@@ -1,0 +1,413 @@
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use nalgebra::Isometry3;
+use rerun::external::re_log_encoding::{Decodable as _, StreamFooter};
+use rerun::external::re_uri::RedapUri;
+use rerun::log::ChunkBatcherConfig;
+use rerun::sink::{FileSink, FileSinkError, GrpcSink, LogSink};
+use rerun::{RecordingStream, RecordingStreamBuilder, SpawnError, SpawnOptions};
+
+use super::config::is_due;
+use super::scene::{self, Scene};
+use super::timeline::{Clock, FRAME, TIME};
+use super::{RecordingConfig, ViewerError, blueprint, image, plots};
+use crate::dataset::RgbdFrame;
+use crate::inertial::ImuSample;
+use crate::odometry::StepReport;
+use crate::vision::{ColorImage, DepthImage, PinholeCamera};
+
+/// Viewers keep the layout that a user has arranged by the application's name.
+const APPLICATION: &str = "mfg-vio";
+/// How long a viewer may take to receive what is left at the end.
+const VIEWER_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Where a recording goes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Sink {
+    /// An `.rrd` file; replaced if it exists.
+    File(PathBuf),
+    /// A running viewer, `rerun+http://HOST:PORT/proxy`.
+    Connect(String),
+    /// A viewer started for the purpose, or the one that already listens on the default port.
+    Spawn,
+}
+
+/// What a recording is called and will hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Contents {
+    /// Name in the viewer's list, and the identity of a recording in a file: viewers merge
+    /// recordings of the same name.
+    pub name: String,
+    /// Whether there will be truth, and so errors to plot.
+    pub truth: bool,
+    /// Whether there will be IMU samples.
+    pub imu: bool,
+}
+
+/// Writes what the pipeline reports to a Rerun recording, on a thread of its own.
+///
+/// A recording that goes into a file is complete: when the writer cannot keep up, the caller
+/// waits. One that only goes to a viewer loses images before it delays the caller. Problems met
+/// on the way do not reach the caller before [`Recorder::finish`].
+#[derive(Debug)]
+pub struct Recorder {
+    config: RecordingConfig,
+    /// Whether images may be left out to keep up.
+    lossy: bool,
+    sender: Option<SyncSender<Message>>,
+    writer: Option<JoinHandle<Result<(), ViewerError>>>,
+    frames: u64,
+    imu_samples: u64,
+    imu: Vec<ImuSample>,
+}
+
+#[derive(Debug)]
+enum Message {
+    Camera { camera: PinholeCamera, imu_from_camera: Isometry3<f64>, size: [usize; 2] },
+    Frame(Box<Frame>),
+    Imu(Vec<ImuSample>),
+}
+
+#[derive(Debug)]
+struct Frame {
+    report: StepReport,
+    truth: Option<Isometry3<f64>>,
+    imu: Vec<ImuSample>,
+    color: Option<ColorImage>,
+    depth: Option<DepthImage>,
+}
+
+impl Recorder {
+    /// Opens the recording and starts its thread.
+    ///
+    /// # Errors
+    /// If the configuration is out of range, no sink is given, a file cannot be created, an
+    /// address is none of a viewer, or no viewer can be started.
+    pub fn new(
+        sinks: &[Sink],
+        contents: &Contents,
+        config: &RecordingConfig,
+    ) -> Result<Self, ViewerError> {
+        config.validate()?;
+        if sinks.is_empty() {
+            return Err(ViewerError::NoSink);
+        }
+        let files: Vec<PathBuf> = sinks.iter().filter_map(Sink::file).collect();
+        let lossy = files.is_empty();
+        let stream = open(sinks, contents, lossy)?;
+        blueprint::send(&stream, APPLICATION, contents)?;
+        scene::log_styles(&stream)?;
+        plots::log_styles(&stream)?;
+        let (sender, receiver) = sync_channel(config.queue_length);
+        let mut writer = Writer::new(stream, config.jpeg_quality);
+        let writer = std::thread::Builder::new()
+            .name("recorder".to_owned())
+            .spawn(move || {
+                writer.run(&receiver);
+                writer.finish(&files)
+            })
+            .map_err(ViewerError::Thread)?;
+        Ok(Self {
+            config: config.clone(),
+            lossy,
+            sender: Some(sender),
+            writer: Some(writer),
+            frames: 0,
+            imu_samples: 0,
+            imu: Vec::new(),
+        })
+    }
+
+    /// Intrinsics, mounting and image size (columns, rows) of the camera; once, before any frame.
+    pub fn camera(
+        &mut self,
+        camera: &PinholeCamera,
+        imu_from_camera: &Isometry3<f64>,
+        size: [usize; 2],
+    ) {
+        let (camera, imu_from_camera) = (*camera, *imu_from_camera);
+        self.send(Message::Camera { camera, imu_from_camera, size });
+    }
+
+    /// A sample of the IMU, bias and noise included. Call it in the order of the stamps.
+    pub fn imu(&mut self, sample: &ImuSample) {
+        if is_due(self.imu_samples, self.config.imu_every) {
+            self.imu.push(*sample);
+        }
+        self.imu_samples += 1;
+    }
+
+    /// A frame that the pipeline has processed, and the true `world_from_body` at its stamp.
+    pub fn frame(
+        &mut self,
+        report: &StepReport,
+        images: &RgbdFrame,
+        truth: Option<&Isometry3<f64>>,
+    ) {
+        let color = is_due(self.frames, self.config.image_every).then(|| images.color.clone());
+        let depth = is_due(self.frames, self.config.depth_every).then(|| images.depth.clone());
+        let imu = std::mem::take(&mut self.imu);
+        self.frames += 1;
+        let report = report.clone();
+        self.send(Message::Frame(Box::new(Frame {
+            report,
+            truth: truth.copied(),
+            imu,
+            color,
+            depth,
+        })));
+    }
+
+    /// Writes what is left and closes the recording; a file then has its footer.
+    ///
+    /// # Errors
+    /// The first problem met since the recording was begun.
+    pub fn finish(mut self) -> Result<(), ViewerError> {
+        self.close()
+    }
+
+    /// A writer that is gone has a reason, which [`Self::close`] returns.
+    fn send(&self, message: Message) {
+        let Some(sender) = &self.sender else { return };
+        match sender.try_send(message) {
+            Err(TrySendError::Full(mut message)) => {
+                if let (true, Message::Frame(frame)) = (self.lossy, &mut message) {
+                    (frame.color, frame.depth) = (None, None);
+                }
+                let _ = sender.send(message);
+            }
+            Ok(()) | Err(TrySendError::Disconnected(_)) => {}
+        }
+    }
+
+    fn close(&mut self) -> Result<(), ViewerError> {
+        let Some(writer) = self.writer.take() else { return Ok(()) };
+        let imu = std::mem::take(&mut self.imu);
+        self.send(Message::Imu(imu));
+        self.sender = None;
+        writer.join().unwrap_or(Err(ViewerError::Panicked))
+    }
+}
+
+impl Drop for Recorder {
+    /// Closes a recording that was not finished, so that its file is complete.
+    fn drop(&mut self) {
+        if let Err(error) = self.close() {
+            tracing::warn!("{error}");
+        }
+    }
+}
+
+impl Sink {
+    fn file(&self) -> Option<PathBuf> {
+        match self {
+            Self::File(path) => Some(path.clone()),
+            Self::Connect(_) | Self::Spawn => None,
+        }
+    }
+
+    fn open(&self) -> Result<Box<dyn LogSink>, ViewerError> {
+        match self {
+            Self::File(path) => Ok(Box::new(create(path)?)),
+            Self::Connect(url) => connect(url),
+            Self::Spawn => connect(&spawn()?),
+        }
+    }
+}
+
+fn create(path: &Path) -> Result<FileSink, ViewerError> {
+    FileSink::new(path).map_err(|error| match error {
+        FileSinkError::CreateFile { source, path } => ViewerError::Create { path, source },
+        FileSinkError::SpawnThread(source) => ViewerError::Thread(source),
+        other => ViewerError::Stream(Box::new(other.into())),
+    })
+}
+
+fn connect(url: &str) -> Result<Box<dyn LogSink>, ViewerError> {
+    match url.parse() {
+        Ok(RedapUri::Proxy(address)) => Ok(Box::new(GrpcSink::new(address))),
+        _ => Err(ViewerError::Address { url: url.to_owned() }),
+    }
+}
+
+/// Starts a viewer that only this machine can reach; returns its address.
+fn spawn() -> Result<String, ViewerError> {
+    let options = SpawnOptions {
+        extra_args: vec!["--bind".to_owned(), "127.0.0.1".to_owned()],
+        hide_welcome_screen: true,
+        ..Default::default()
+    };
+    let viewer = rerun::spawn(&options).map_err(|error| match error {
+        SpawnError::Io(source) => ViewerError::Spawn(source),
+        SpawnError::ExecutableNotFoundInPath { .. } | SpawnError::ExecutableNotFound { .. } => {
+            ViewerError::NoViewer { version: rerun::build_info().version.to_string() }
+        }
+    })?;
+    Ok(format!("rerun+http://127.0.0.1:{}/proxy", viewer.port))
+}
+
+fn open(sinks: &[Sink], contents: &Contents, live: bool) -> Result<RecordingStream, ViewerError> {
+    let opened: Vec<Box<dyn LogSink>> = sinks.iter().map(Sink::open).collect::<Result<_, _>>()?;
+    let mut builder = RecordingStreamBuilder::new(APPLICATION)
+        // Asking for a recording outweighs the environment's `RERUN=off`.
+        .enabled(true);
+    if live {
+        builder = builder.batcher_config(ChunkBatcherConfig::LOW_LATENCY);
+    } else {
+        // Few large chunks: each costs a kilobyte and time in the viewer. That they end by size
+        // rather than by the clock makes files of the same run alike.
+        let flush_tick = Duration::from_secs(10);
+        builder = builder
+            .batcher_config(ChunkBatcherConfig { flush_tick, ..ChunkBatcherConfig::DEFAULT })
+            .recording_id(contents.name.as_str());
+    }
+    let stream = builder.set_sinks(opened)?;
+    stream.set_log_time_enabled(false);
+    stream.send_recording_name(contents.name.as_str())?;
+    Ok(stream)
+}
+
+/// The end of the queue that does the work.
+struct Writer {
+    stream: RecordingStream,
+    jpeg_quality: u8,
+    clock: Option<Clock>,
+    scene: Scene,
+    problem: Option<ViewerError>,
+}
+
+impl Writer {
+    fn new(stream: RecordingStream, jpeg_quality: u8) -> Self {
+        Self { stream, jpeg_quality, clock: None, scene: Scene::default(), problem: None }
+    }
+
+    /// Writes until the queue is closed. A message that cannot be written is left out, for the
+    /// rest of the recording is still of use.
+    fn run(&mut self, receiver: &Receiver<Message>) {
+        for message in receiver {
+            let result = match message {
+                Message::Camera { camera, imu_from_camera, size } => {
+                    scene::log_camera(&self.stream, &camera, &imu_from_camera, size)
+                        .map_err(ViewerError::from)
+                }
+                Message::Frame(frame) => self.log_frame(&frame),
+                Message::Imu(samples) => self.log_imu(&samples),
+            };
+            if let Err(error) = result {
+                self.problem.get_or_insert(error);
+            }
+        }
+    }
+
+    fn log_frame(&mut self, frame: &Frame) -> Result<(), ViewerError> {
+        let Frame { report, truth, imu, color, depth } = frame;
+        self.log_imu(imu)?;
+        let clock = *self.clock.get_or_insert_with(|| Clock::of(report.stamp));
+        let number = i64::try_from(report.frame).unwrap_or(i64::MAX);
+        self.stream.set_time(TIME, clock.cell(report.stamp));
+        self.stream.set_time_sequence(FRAME, number);
+
+        self.scene.log_report(&self.stream, report, truth.as_ref())?;
+        plots::log_report(&self.stream, report, truth.as_ref())?;
+        scene::log_notes(&self.stream, &report.notes)?;
+        if let Some(color) = color {
+            let encoded = image::color(color, self.jpeg_quality, report.frame)?;
+            self.stream.log(scene::COLOR, &encoded)?;
+            scene::log_keypoints(&self.stream, &report.keypoints)?;
+        }
+        if let Some(depth) = depth {
+            self.stream.log(scene::DEPTH, &image::depth(depth, report.frame)?)?;
+        }
+        Ok(())
+    }
+
+    fn log_imu(&mut self, samples: &[ImuSample]) -> Result<(), ViewerError> {
+        let Some(first) = samples.first() else { return Ok(()) };
+        let clock = *self.clock.get_or_insert_with(|| Clock::of(first.stamp));
+        Ok(plots::log_imu(&self.stream, clock, samples)?)
+    }
+
+    fn finish(mut self, files: &[PathBuf]) -> Result<(), ViewerError> {
+        let rest = self.scene.log_rest(&self.stream).map_err(ViewerError::from);
+        let timeout = if files.is_empty() { VIEWER_TIMEOUT } else { Duration::MAX };
+        let flushed = self.stream.flush_with_timeout(timeout).map_err(ViewerError::from);
+        // Dropping the last handle writes the footers.
+        drop(self.stream);
+        if let Some(problem) = self.problem {
+            return Err(problem);
+        }
+        rest.and(flushed)?;
+        files.iter().try_for_each(|path| check_complete(path))
+    }
+}
+
+/// Rerun tells of a failure to write only in its log; a footer tells that there was none.
+fn check_complete(path: &Path) -> Result<(), ViewerError> {
+    use std::io::{Read, Seek, SeekFrom};
+
+    let end = i64::try_from(StreamFooter::ENCODED_SIZE_BYTES).unwrap_or(i64::MAX);
+    let mut bytes = Vec::new();
+    let complete = std::fs::File::open(path)
+        .and_then(|mut file| {
+            file.seek(SeekFrom::End(-end))?;
+            file.read_to_end(&mut bytes)
+        })
+        .is_ok_and(|_| StreamFooter::from_rrd_bytes(&bytes).is_ok());
+    if complete { Ok(()) } else { Err(ViewerError::CutShort { path: path.to_owned() }) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A recorder whose queue of one message nobody empties yet.
+    fn stalled(lossy: bool) -> (Recorder, Receiver<Message>) {
+        let (sender, receiver) = sync_channel(1);
+        let recorder = Recorder {
+            config: RecordingConfig::default(),
+            lossy,
+            sender: Some(sender),
+            writer: None,
+            frames: 0,
+            imu_samples: 0,
+            imu: Vec::new(),
+        };
+        (recorder, receiver)
+    }
+
+    /// For each frame that arrives, whether it has its color image.
+    fn arrivals(lossy: bool) -> Vec<bool> {
+        let (mut recorder, receiver) = stalled(lossy);
+        recorder.config.image_every = 1;
+        let sending = std::thread::spawn(move || {
+            for frame in 0..3 {
+                let (report, images) = super::super::tests::frame(frame);
+                recorder.frame(&report, &images, None);
+            }
+        });
+        // The second frame meets a full queue before the first is taken.
+        std::thread::sleep(Duration::from_millis(50));
+        let first = receiver.recv();
+        std::thread::sleep(Duration::from_millis(50));
+        let frames: Vec<bool> = first
+            .into_iter()
+            .chain(&receiver)
+            .map(|message| matches!(message, Message::Frame(frame) if frame.color.is_some()))
+            .collect();
+        sending.join().unwrap();
+        frames
+    }
+
+    #[test]
+    fn a_full_queue_costs_a_live_view_images_but_no_frames() {
+        assert_eq!(arrivals(true), [true, false, false]);
+    }
+
+    #[test]
+    fn a_full_queue_costs_a_file_nothing() {
+        assert_eq!(arrivals(false), [true, true, true]);
+    }
+}
