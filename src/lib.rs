@@ -6,6 +6,7 @@
 //! x to the right and y down; SI units throughout; `measured = true + bias + noise`.
 
 pub mod alignment;
+pub mod config;
 pub mod dataset;
 pub mod distribution;
 pub mod evaluation;
@@ -13,8 +14,8 @@ pub mod filter;
 pub mod inertial;
 pub mod map;
 pub mod odometry;
+pub mod replay;
 pub mod simulation;
 pub mod so3;
-#[cfg(feature = "viewer")]
 pub mod viewer;
 pub mod vision;

@@ -1,0 +1,76 @@
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+
+use anyhow::Context;
+
+use super::replay::{Plan, Settings, Target, print_summary};
+use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use mfg_vio::config::Config;
+use mfg_vio::dataset::{self, Event, LogWriter};
+use mfg_vio::evaluation::write_html;
+use mfg_vio::replay::report;
+use mfg_vio::simulation::{SceneConfig, Simulation};
+
+/// Simulate a short log, replay it, evaluate it and draw it: the main job with no data at hand.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  mfg-vio demo --out demo\n  rerun demo/run.rrd")]
+pub struct Args {
+    /// Directory for the log, the results, the recording and the report.
+    #[arg(long, value_name = "DIR", default_value = "demo")]
+    out: PathBuf,
+    #[command(flatten)]
+    settings: Settings,
+}
+
+const DEMO_SECONDS: f64 = 10.0;
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    catch_interrupts()?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("{}", args.out.display()))?;
+    let log = args.out.join("demo.mcap");
+    simulate(&log)?;
+
+    let config_name = "sim".to_owned();
+    let config = Config::shipped(&config_name, args.settings.overrides())?;
+    let plan = Plan {
+        log: &log,
+        settings: &args.settings,
+        config,
+        config_origin: config_name,
+        out: Some(args.out.clone()),
+        truth: None,
+        start: 0.0,
+        duration: f64::INFINITY,
+        summary: dataset::detect(&log)?,
+        recording: Target::files(&args.out),
+    };
+    let replayed = plan.execute()?;
+    let report = report(&replayed)?;
+    write_html(&args.out.join("report.html"), &report)?;
+    for (figure, name) in report.figures.iter().zip(["trajectory", "error", "features", "timing"]) {
+        figure.save(&args.out.join(name).with_extension("png"))?;
+    }
+    print_summary(&replayed.metrics, Some(&args.out));
+    Ok(())
+}
+
+fn simulate(log: &Path) -> anyhow::Result<()> {
+    let scene = SceneConfig { duration: DEMO_SECONDS, ..SceneConfig::default() };
+    let mut simulation = Simulation::new(scene)?;
+    let mut writer = LogWriter::create(log, simulation.config().log.clone())?;
+    simulation.write_calibration(&mut writer)?;
+    let frames = DEMO_SECONDS * simulation.config().image.rate;
+    let bar = progress(Some(frames as u64 + 1), "simulated");
+    for event in &mut simulation {
+        writer.event(&event)?;
+        if matches!(event, Event::Frame(_)) {
+            bar.inc(1);
+        }
+        if INTERRUPTED.load(Ordering::Relaxed) {
+            break;
+        }
+    }
+    bar.finish_and_clear();
+    writer.finish()?;
+    Ok(())
+}

@@ -1,0 +1,840 @@
+//! `mfg-vio evaluate`: trajectory error, consistency and comparison of runs.
+
+use std::io::Write;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::{Args, Subcommand, ValueEnum};
+use mfg_vio::evaluation::report::{Report, write_html};
+use mfg_vio::evaluation::{
+    self, Alignment, ApeOptions, AssociationOptions, Cell, Delta, Figure, NeesOptions, NeesSummary,
+    Relation, RpeOptions, Similarity, Statistics, SubTrajectoryError, Table, TrajectoryFile,
+    TrajectoryFormat,
+};
+use serde::Serialize;
+
+#[derive(Debug, Args)]
+pub struct EvaluateArgs {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Absolute pose error: how far aligned estimates are from a reference
+    #[command(after_help = APE_HELP)]
+    Ape(ApeArgs),
+    /// Relative pose error: how far the motion over a distance is off
+    #[command(after_help = RPE_HELP)]
+    Rpe(RpeArgs),
+    /// Consistency: are the errors of a run as large as it believes?
+    #[command(after_help = NEES_HELP)]
+    Nees(NeesArgs),
+    /// One table of many runs
+    #[command(after_help = COMPARE_HELP)]
+    Compare(CompareArgs),
+}
+
+const APE_HELP: &str = "\
+Formats are guessed from the content: TUM (t x y z qx qy qz qw), EuRoC csv
+(t_ns,x,y,z,qw,qx,qy,qz,...; also that of the VCU-RVI authors), KITTI (3x4).
+
+Example:
+  printf '%s\\n' '0 0 0 0 0 0 0 1' '1 1 0 0 0 0 0 1' '2 1 1 0 0 0 0 1' > ref.txt
+  printf '%s\\n' '0 0 0 0 0 0 0 1' '1 1 0 0 0 0 0 1' '2 1 1.1 0 0 0 0 1' > est.txt
+  mfg-vio evaluate ape ref.txt est.txt --align yaw --plot ape.svg";
+
+const RPE_HELP: &str = "\
+Example:
+  printf '%s\\n' '0 0 0 0 0 0 0 1' '1 1 0 0 0 0 0 1' '2 1 1 0 0 0 0 1' > ref.txt
+  printf '%s\\n' '0 0 0 0 0 0 0 1' '1 1 0 0 0 0 0 1' '2 1 1.1 0 0 0 0 1' > est.txt
+  mfg-vio evaluate rpe ref.txt est.txt --delta 1 --unit m --all-pairs --lengths 1,2";
+
+const NEES_HELP: &str = "\
+DIR is what `replay --out DIR` wrote, or a state.csv. Worlds are aligned at the
+first matched pose unless --align says otherwise; none if they are the same.
+
+Example:
+  mfg-vio simulate --out sim.mcap --duration 10 && mfg-vio replay sim.mcap --out run
+  mfg-vio evaluate nees run/trajectory.tum run --report nees.html";
+
+const COMPARE_HELP: &str = "\
+A DIR is what `replay --out DIR` wrote from a log with a reference, or holds
+several of these; then runs of the same name are compared in pairs.
+
+Example:
+  mfg-vio simulate --out sim.mcap --duration 10
+  mfg-vio replay sim.mcap --filter mfgr --out mfgr && mfg-vio replay sim.mcap --filter mekfr --out mekfr
+  mfg-vio evaluate compare mfgr mekfr --plot compare.svg";
+
+pub fn run(args: EvaluateArgs) -> anyhow::Result<()> {
+    match args.command {
+        Command::Ape(args) => ape(&args),
+        Command::Rpe(args) => rpe(&args),
+        Command::Nees(args) => nees(&args),
+        Command::Compare(args) => compare(&args),
+    }
+}
+
+#[derive(Debug, Args)]
+struct ApeArgs {
+    #[command(flatten)]
+    inputs: Inputs,
+    /// What is taken from the estimate before it is compared
+    #[arg(long, value_enum, default_value = "se3")]
+    align: AlignArg,
+    /// Report the scale that Sim(3) alignment would find
+    #[arg(long)]
+    scale_check: bool,
+    #[command(flatten)]
+    output: Output,
+}
+
+#[derive(Debug, Args)]
+struct RpeArgs {
+    #[command(flatten)]
+    inputs: Inputs,
+    /// What is taken from the estimate first; only the scale of sim3 matters
+    #[arg(long, value_enum, default_value = "none")]
+    align: AlignArg,
+    /// Distance of the two poses, in units of --unit
+    #[arg(long, value_name = "N", default_value_t = 1.0, value_parser = positive)]
+    delta: f64,
+    /// Frames, seconds, metres of path, or degrees
+    #[arg(long, value_enum, default_value = "f")]
+    unit: UnitArg,
+    /// From every pose, not one pair after the other
+    #[arg(long)]
+    all_pairs: bool,
+    /// Also the error over sub-trajectories of these lengths, m
+    #[arg(long, value_name = "A,B,C", value_delimiter = ',', value_parser = positive)]
+    lengths: Vec<f64>,
+    #[command(flatten)]
+    output: Output,
+}
+
+#[derive(Debug, Args)]
+struct NeesArgs {
+    /// Reference trajectory (ground truth)
+    #[arg(value_name = "REF")]
+    reference: PathBuf,
+    /// Directory of a run
+    #[arg(value_name = "DIR")]
+    directory: PathBuf,
+    #[command(flatten)]
+    matching: Matching,
+    /// How the reference's world is put on the estimate's
+    #[arg(long, value_enum, default_value = "origin")]
+    align: AlignArg,
+    #[command(flatten)]
+    output: Output,
+}
+
+#[derive(Debug, Args)]
+struct CompareArgs {
+    /// Directories of runs
+    #[arg(value_name = "DIR", required = true)]
+    directories: Vec<PathBuf>,
+    /// Largest position RMSE of a run that counts as a success, m
+    #[arg(long, value_name = "M", default_value_t = 1.0, value_parser = positive)]
+    success: f64,
+    #[command(flatten)]
+    output: Output,
+}
+
+/// What is compared with what.
+#[derive(Debug, Args)]
+struct Inputs {
+    /// Reference trajectory (ground truth)
+    #[arg(value_name = "REF")]
+    reference: PathBuf,
+    /// Estimated trajectories
+    #[arg(value_name = "EST", required = true)]
+    estimates: Vec<PathBuf>,
+    #[command(flatten)]
+    matching: Matching,
+    /// Part of the pose error: translation (m) or rotation angle (degrees)
+    #[arg(long, value_enum, default_value = "trans")]
+    relation: RelationArg,
+}
+
+#[derive(Debug, Args)]
+struct Matching {
+    /// Align over the first N matched poses only
+    #[arg(long, value_name = "N")]
+    align_n: Option<NonZeroUsize>,
+    /// Largest time difference of poses that are compared, s
+    #[arg(long, value_name = "S", default_value_t = 0.01, value_parser = non_negative)]
+    max_diff: f64,
+    /// Added to the stamps of the estimate, s; auto: found from angular rates
+    #[arg(
+        long,
+        value_name = "S|auto",
+        default_value = "0",
+        allow_negative_numbers = true,
+        value_parser = time_offset
+    )]
+    time_offset: TimeOffset,
+}
+
+#[derive(Debug, Args)]
+struct Output {
+    /// One JSON object on standard output
+    #[arg(long, conflicts_with_all = ["csv", "latex"])]
+    json: bool,
+    /// A CSV table on standard output
+    #[arg(long, conflicts_with = "latex")]
+    csv: bool,
+    /// A LaTeX table (booktabs) on standard output
+    #[arg(long)]
+    latex: bool,
+    /// Plot, as SVG or PNG
+    #[arg(long, value_name = "FILE", value_parser = plot_file)]
+    plot: Option<PathBuf>,
+    /// Self-contained HTML report
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum AlignArg {
+    /// Rotation and translation
+    Se3,
+    /// Rotation, translation and scale
+    Sim3,
+    /// Heading and translation
+    Yaw,
+    /// First pose on first pose
+    Origin,
+    /// Nothing
+    None,
+}
+
+impl From<AlignArg> for Alignment {
+    fn from(value: AlignArg) -> Self {
+        match value {
+            AlignArg::Se3 => Self::Se3,
+            AlignArg::Sim3 => Self::Sim3,
+            AlignArg::Yaw => Self::Yaw,
+            AlignArg::Origin => Self::Origin,
+            AlignArg::None => Self::None,
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum RelationArg {
+    Trans,
+    Angle,
+}
+
+impl From<RelationArg> for Relation {
+    fn from(value: RelationArg) -> Self {
+        match value {
+            RelationArg::Trans => Self::Translation,
+            RelationArg::Angle => Self::Angle,
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, ValueEnum)]
+enum UnitArg {
+    F,
+    S,
+    M,
+    Deg,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum TimeOffset {
+    Fixed(f64),
+    Auto,
+}
+
+fn time_offset(text: &str) -> Result<TimeOffset, String> {
+    if text == "auto" { Ok(TimeOffset::Auto) } else { finite(text).map(TimeOffset::Fixed) }
+}
+
+fn finite(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value.is_finite() => Ok(value),
+        _ => Err("not a finite number".to_owned()),
+    }
+}
+
+fn non_negative(text: &str) -> Result<f64, String> {
+    finite(text).and_then(|x| if x >= 0.0 { Ok(x) } else { Err("must not be negative".to_owned()) })
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    finite(text).and_then(|x| if x > 0.0 { Ok(x) } else { Err("must be above 0".to_owned()) })
+}
+
+fn plot_file(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+    match extension.as_deref() {
+        Some("svg" | "png") => Ok(path),
+        _ => Err("a plot is saved as .svg or .png".to_owned()),
+    }
+}
+
+/// The JSON object of one estimate.
+#[derive(Serialize)]
+struct EstimateReport {
+    file: String,
+    matched: usize,
+    reference_poses: usize,
+    estimate_poses: usize,
+    relation: &'static str,
+    /// Of the statistics.
+    unit: &'static str,
+    #[serde(flatten)]
+    statistics: Statistics,
+    alignment: Similarity,
+    /// Seconds added to the stamps of the estimate.
+    time_offset: f64,
+    #[serde(flatten)]
+    kind: Kind,
+    warnings: Vec<String>,
+}
+
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Kind {
+    Absolute {
+        /// What Sim(3) alignment would find; only with `--scale-check`, null if undetermined.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        scale_check: Option<Option<f64>>,
+    },
+    Relative {
+        /// Number of relative errors.
+        pairs: usize,
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        sub_trajectories: Vec<SubTrajectory>,
+    },
+}
+
+#[derive(Serialize)]
+struct SubTrajectory {
+    length: f64,
+    pairs: usize,
+    translation: Statistics,
+    rotation_deg: Statistics,
+    drift_percent: f64,
+}
+
+impl From<&SubTrajectoryError> for SubTrajectory {
+    fn from(error: &SubTrajectoryError) -> Self {
+        Self {
+            length: error.length,
+            pairs: error.translation_errors.len(),
+            translation: error.translation,
+            rotation_deg: error.rotation,
+            drift_percent: error.drift_percent(),
+        }
+    }
+}
+
+/// Everything that a command has to show, before it is known where.
+struct Presentation {
+    title: String,
+    notes: Vec<String>,
+    warnings: Vec<String>,
+    json: serde_json::Value,
+    /// The first one is what `--csv` and `--latex` print.
+    tables: Vec<(String, Table)>,
+    /// The first one is what `--plot` saves.
+    figures: Vec<Figure>,
+}
+
+fn ape(args: &ApeArgs) -> anyhow::Result<()> {
+    let inputs = &args.inputs;
+    let alignment = Alignment::from(args.align);
+    let reference = read(&inputs.reference)?;
+    let mut reports = Vec::new();
+    let mut figures = Vec::new();
+    let mut groups = Vec::new();
+    for path in &inputs.estimates {
+        let estimate = read_beside(path, &reference)?;
+        let options = ApeOptions {
+            association: inputs.matching.association(path, &reference, &estimate)?,
+            alignment,
+            align_n: inputs.matching.align_n.map(NonZeroUsize::get),
+            relation: inputs.relation.into(),
+        };
+        let file = path.display().to_string();
+        let (reference, estimate) = (&reference.trajectory, &estimate.trajectory);
+        let pairs = evaluation::associate(reference, estimate, &options.association)
+            .with_context(|| file.clone())?;
+        let suspicions = evaluation::suspicions(reference, estimate, &pairs, &options);
+        let scale_check = args.scale_check.then(|| evaluation::similarity_scale(&pairs));
+        let result = evaluation::ape_of_pairs(pairs, alignment, options.align_n, options.relation)
+            .with_context(|| file.clone())?;
+        if args.output.draws() {
+            let unit = options.relation.unit();
+            figures.push(
+                evaluation::trajectory_figure(&result.pairs, &result.errors, unit).titled(&file),
+            );
+            let stamps = &result.pairs.stamps;
+            figures
+                .push(evaluation::error_figure(stamps, &result.errors, unit, None).titled(&file));
+            groups.push((name_of(path), result.errors));
+        }
+        reports.push(EstimateReport {
+            file,
+            matched: result.pairs.len(),
+            reference_poses: result.pairs.reference_poses,
+            estimate_poses: result.pairs.estimate_poses,
+            relation: options.relation.name(),
+            unit: options.relation.unit(),
+            statistics: result.statistics,
+            alignment: result.alignment,
+            time_offset: options.association.time_offset,
+            kind: Kind::Absolute { scale_check },
+            warnings: suspicions.iter().map(ToString::to_string).collect(),
+        });
+    }
+    let relation = Relation::from(inputs.relation);
+    let title = format!("Absolute pose error ({}), {alignment} alignment", relation.unit());
+    if groups.len() > 1 {
+        let all =
+            evaluation::groups_figure(&title, &format!("error ({})", relation.unit()), groups);
+        figures.insert(0, all);
+    }
+    let mut presentation = present(title, &inputs.reference, &reports, figures)?;
+    if args.scale_check {
+        presentation.tables.push(("Scale of Sim(3) alignment".to_owned(), scale_table(&reports)));
+    }
+    args.output.emit(&presentation)
+}
+
+fn rpe(args: &RpeArgs) -> anyhow::Result<()> {
+    let inputs = &args.inputs;
+    let delta = match args.unit {
+        UnitArg::F if args.delta.fract() == 0.0 => Delta::Frames(args.delta as usize),
+        UnitArg::F => bail!("--delta {}: a number of frames must be whole", args.delta),
+        UnitArg::S => Delta::Seconds(args.delta),
+        UnitArg::M => Delta::Metres(args.delta),
+        UnitArg::Deg => Delta::Degrees(args.delta),
+    };
+    let reference = read(&inputs.reference)?;
+    let mut reports = Vec::new();
+    let mut figures = Vec::new();
+    let mut groups = Vec::new();
+    for path in &inputs.estimates {
+        let estimate = read_beside(path, &reference)?;
+        let options = RpeOptions {
+            association: inputs.matching.association(path, &reference, &estimate)?,
+            alignment: args.align.into(),
+            align_n: inputs.matching.align_n.map(NonZeroUsize::get),
+            relation: inputs.relation.into(),
+            delta,
+            all_pairs: args.all_pairs,
+        };
+        let file = path.display().to_string();
+        let (reference, estimate) = (&reference.trajectory, &estimate.trajectory);
+        let result =
+            evaluation::rpe(reference, estimate, &options).with_context(|| file.clone())?;
+        let lengths = evaluation::sub_trajectory_errors(&result.pairs, &args.lengths)
+            .with_context(|| file.clone())?;
+        let mut warnings = Vec::new();
+        for length in &args.lengths {
+            if !lengths.iter().any(|error| error.length == *length) {
+                warnings.push(format!("the reference has no sub-trajectory of {length} m"));
+            }
+        }
+        if args.output.draws() {
+            if !lengths.is_empty() {
+                figures.push(evaluation::relative_error_figure(&lengths).titled(&file));
+            }
+            let ends: Vec<f64> = result
+                .links
+                .iter()
+                .filter_map(|&(_, j)| result.pairs.stamps.get(j).copied())
+                .collect();
+            let unit = options.relation.unit();
+            figures.push(evaluation::error_figure(&ends, &result.errors, unit, None).titled(&file));
+            groups.push((name_of(path), result.errors));
+        }
+        reports.push(EstimateReport {
+            file,
+            matched: result.pairs.len(),
+            reference_poses: result.pairs.reference_poses,
+            estimate_poses: result.pairs.estimate_poses,
+            relation: options.relation.name(),
+            unit: options.relation.unit(),
+            statistics: result.statistics,
+            alignment: result.alignment,
+            time_offset: options.association.time_offset,
+            kind: Kind::Relative {
+                pairs: result.links.len(),
+                sub_trajectories: lengths.iter().map(Into::into).collect(),
+            },
+            warnings,
+        });
+    }
+    let unit = Relation::from(inputs.relation).unit();
+    let pairs = if args.all_pairs { "all pairs" } else { "consecutive pairs" };
+    let title =
+        format!("Relative pose error ({unit}) over {} {}, {pairs}", args.delta, delta.unit());
+    if groups.len() > 1 {
+        figures.insert(0, evaluation::groups_figure(&title, &format!("error ({unit})"), groups));
+    }
+    let mut presentation = present(title, &inputs.reference, &reports, figures)?;
+    if !args.lengths.is_empty() {
+        let table = sub_trajectory_table(&reports);
+        presentation.tables.push(("Error over sub-trajectories".to_owned(), table));
+    }
+    args.output.emit(&presentation)
+}
+
+fn present(
+    title: String,
+    reference: &Path,
+    reports: &[EstimateReport],
+    figures: Vec<Figure>,
+) -> anyhow::Result<Presentation> {
+    let json = match reports {
+        [single] => serde_json::to_value(single)?,
+        several => serde_json::json!({ "estimates": several }),
+    };
+    let mut notes = vec![format!("reference: {}", reference.display())];
+    let mut warnings = Vec::new();
+    for report in reports {
+        let EstimateReport { file, matched, estimate_poses, time_offset, .. } = report;
+        let offset = match time_offset {
+            0.0 => String::new(),
+            seconds => format!(", time offset {seconds:.4} s"),
+        };
+        notes.push(format!("{file}: matched {matched} of {estimate_poses} poses{offset}"));
+        warnings.extend(report.warnings.iter().map(|warning| format!("{file}: {warning}")));
+    }
+    let tables = vec![("Errors".to_owned(), statistics_table(reports))];
+    Ok(Presentation { title, notes, warnings, json, tables, figures })
+}
+
+fn statistics_table(reports: &[EstimateReport]) -> Table {
+    let mut table =
+        Table::new(["file", "matched", "of", "rmse", "mean", "median", "std", "min", "max", "sse"]);
+    for report in reports {
+        let mut row: Vec<Cell> =
+            vec![report.file.as_str().into(), report.matched.into(), report.estimate_poses.into()];
+        row.extend(report.statistics.entries().map(|(_, value)| value.into()));
+        table.rows.push(row);
+    }
+    table
+}
+
+fn scale_table(reports: &[EstimateReport]) -> Table {
+    let mut table = Table::new(["file", "scale"]);
+    for report in reports {
+        if let Kind::Absolute { scale_check: Some(scale) } = report.kind {
+            table.rows.push(vec![report.file.as_str().into(), scale.into()]);
+        }
+    }
+    table
+}
+
+fn sub_trajectory_table(reports: &[EstimateReport]) -> Table {
+    let mut table = Table::new([
+        "file",
+        "length (m)",
+        "pairs",
+        "mean (m)",
+        "rmse (m)",
+        "drift (%)",
+        "mean (deg)",
+        "rmse (deg)",
+    ]);
+    for report in reports {
+        if let Kind::Relative { sub_trajectories, .. } = &report.kind {
+            for sub in sub_trajectories {
+                table.rows.push(vec![
+                    report.file.as_str().into(),
+                    sub.length.into(),
+                    sub.pairs.into(),
+                    sub.translation.mean.into(),
+                    sub.translation.rmse.into(),
+                    sub.drift_percent.into(),
+                    sub.rotation_deg.mean.into(),
+                    sub.rotation_deg.rmse.into(),
+                ]);
+            }
+        }
+    }
+    table
+}
+
+fn nees(args: &NeesArgs) -> anyhow::Result<()> {
+    let reference = read(&args.reference)?;
+    let path = match args.directory.is_dir() {
+        true => args.directory.join("state.csv"),
+        false => args.directory.clone(),
+    };
+    let estimate = evaluation::read_believed_trajectory(&path)?;
+    let association = match args.matching.time_offset {
+        TimeOffset::Fixed(time_offset) => {
+            AssociationOptions { max_diff: args.matching.max_diff, time_offset }
+        }
+        TimeOffset::Auto => {
+            args.matching.found_offset(&path, &reference.trajectory, &estimate.trajectory)?
+        }
+    };
+    let options = NeesOptions {
+        association,
+        alignment: args.align.into(),
+        align_n: args.matching.align_n.map(NonZeroUsize::get),
+        ..Default::default()
+    };
+    let result = evaluation::nees(&reference.trajectory, &estimate, &options)
+        .with_context(|| path.display().to_string())?;
+    let mut warnings = Vec::new();
+    if result.singular > 0 {
+        let of = result.matched;
+        warnings.push(format!("{} of {of} covariances are not positive definite", result.singular));
+    }
+    let parts =
+        [("attitude", &result.attitude), ("position", &result.position), ("joint", &result.joint)];
+    let mut table =
+        Table::new(["part", "dof", "mean", "median", "band from", "to", "inside", "above"]);
+    for (name, summary) in parts {
+        let NeesSummary { dof, mean, median, band: [low, high], inside, above } = *summary;
+        table.rows.push(vec![
+            name.into(),
+            dof.into(),
+            mean.into(),
+            median.into(),
+            low.into(),
+            high.into(),
+            inside.into(),
+            above.into(),
+        ]);
+    }
+    let json = serde_json::json!({
+        "file": path.display().to_string(),
+        "matched": result.matched,
+        "reference_poses": result.reference_poses,
+        "estimate_poses": result.estimate_poses,
+        "singular": result.singular,
+        "time_offset": association.time_offset,
+        "attitude": result.attitude,
+        "position": result.position,
+        "joint": result.joint,
+        "warnings": warnings,
+    });
+    let figures = if args.output.draws() {
+        vec![evaluation::belief_figure(&result), evaluation::nees_figure(&result)]
+    } else {
+        Vec::new()
+    };
+    args.output.emit(&Presentation {
+        title: format!("NEES, {} alignment", options.alignment),
+        notes: vec![
+            format!("reference: {}", args.reference.display()),
+            format!(
+                "{}: matched {} of {} poses",
+                path.display(),
+                result.matched,
+                result.estimate_poses
+            ),
+        ],
+        warnings,
+        json,
+        tables: vec![("Consistency (95 % chi-square band)".to_owned(), table)],
+        figures,
+    })
+}
+
+fn compare(args: &CompareArgs) -> anyhow::Result<()> {
+    let comparison = evaluation::compare(&args.directories, args.success)?;
+    let mut methods = Table::new([
+        "method",
+        "runs",
+        "success (%)",
+        "mean rmse (m)",
+        "mean rmse (deg)",
+        "mean drift (%)",
+    ]);
+    let mut runs = Table::new([
+        "method",
+        "run",
+        "matched",
+        "rmse (m)",
+        "rmse (deg)",
+        "drift (%)",
+        "real-time factor",
+    ]);
+    for method in &comparison.methods {
+        methods.rows.push(vec![
+            method.name.as_str().into(),
+            method.runs.len().into(),
+            (100.0 * method.success_rate).into(),
+            method.mean_position_rmse.into(),
+            method.mean_attitude_rmse.into(),
+            method.mean_drift_percent.into(),
+        ]);
+        for run in &method.runs {
+            runs.rows.push(vec![
+                method.name.as_str().into(),
+                run.name.as_str().into(),
+                run.matched.into(),
+                run.position_rmse.into(),
+                run.attitude_rmse.into(),
+                run.drift_percent.into(),
+                run.real_time_factor.into(),
+            ]);
+        }
+    }
+    let mut tables = vec![("Methods".to_owned(), methods), ("Runs".to_owned(), runs)];
+    if !comparison.tests.is_empty() {
+        let mut table = Table::new(["first", "second", "runs", "mean difference (m)", "p"]);
+        for test in &comparison.tests {
+            table.rows.push(vec![
+                test.first.as_str().into(),
+                test.second.as_str().into(),
+                test.runs.into(),
+                test.mean_difference.into(),
+                test.p_value.into(),
+            ]);
+        }
+        tables.push(("Paired t-tests of the position RMSE".to_owned(), table));
+    }
+    let groups = comparison.methods.iter().map(|method| {
+        (method.name.clone(), method.runs.iter().filter_map(|run| run.position_rmse).collect())
+    });
+    let figure =
+        evaluation::groups_figure("Position RMSE of the runs", "RMSE (m)", groups.collect());
+    args.output.emit(&Presentation {
+        title: "Comparison of runs".to_owned(),
+        notes: vec![format!("success: position RMSE of at most {} m", args.success)],
+        warnings: Vec::new(),
+        json: serde_json::to_value(&comparison)?,
+        tables,
+        figures: vec![figure],
+    })
+}
+
+impl Output {
+    fn draws(&self) -> bool {
+        self.plot.is_some() || self.report.is_some()
+    }
+
+    /// Prints and saves what was asked for; warnings and what has no place in a machine-readable
+    /// answer go to standard error.
+    fn emit(&self, presentation: &Presentation) -> anyhow::Result<()> {
+        let Presentation { title, notes, warnings, json, tables, figures } = presentation;
+        if let (Some(path), Some(figure)) = (&self.plot, figures.first()) {
+            figure.save(path)?;
+        }
+        if let Some(path) = &self.report {
+            let report = Report {
+                title: title.clone(),
+                notes: notes.clone(),
+                warnings: warnings.clone(),
+                tables: tables.clone(),
+                figures: figures.clone(),
+            };
+            write_html(path, &report)?;
+        }
+        let first = tables.first().map(|(_, table)| table);
+        let machine = match first {
+            _ if self.json => Some(serde_json::to_string_pretty(json)? + "\n"),
+            Some(table) if self.csv => Some(table.to_csv()),
+            Some(table) if self.latex => Some(table.to_latex()),
+            _ => None,
+        };
+        for warning in warnings {
+            eprintln!("warning: {warning}");
+        }
+        let text = match machine {
+            Some(text) => {
+                for note in notes {
+                    eprintln!("{note}");
+                }
+                text
+            }
+            None => {
+                let mut text = format!("{title}\n{}\n", notes.join("\n"));
+                for (heading, table) in tables {
+                    text.push_str(&format!("\n{heading}\n{}", table.to_text()));
+                }
+                text
+            }
+        };
+        // A reader that closes the pipe early is no error.
+        match std::io::stdout().write_all(text.as_bytes()) {
+            Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(e.into()),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Matching {
+    fn association(
+        &self,
+        path: &Path,
+        reference: &TrajectoryFile,
+        estimate: &TrajectoryFile,
+    ) -> anyhow::Result<AssociationOptions> {
+        match self.time_offset {
+            TimeOffset::Fixed(time_offset) => {
+                Ok(AssociationOptions { max_diff: self.max_diff, time_offset })
+            }
+            TimeOffset::Auto if estimate.format == TrajectoryFormat::Kitti => {
+                bail!("{}: KITTI poses have no stamps to find --time-offset from", path.display())
+            }
+            TimeOffset::Auto => {
+                self.found_offset(path, &reference.trajectory, &estimate.trajectory)
+            }
+        }
+    }
+
+    fn found_offset(
+        &self,
+        path: &Path,
+        reference: &evaluation::Trajectory,
+        estimate: &evaluation::Trajectory,
+    ) -> anyhow::Result<AssociationOptions> {
+        let offset = evaluation::estimate_clock_offset(reference, estimate)
+            .with_context(|| path.display().to_string())?;
+        Ok(AssociationOptions { max_diff: self.max_diff, time_offset: offset.seconds })
+    }
+}
+
+fn read(path: &Path) -> anyhow::Result<TrajectoryFile> {
+    let file = evaluation::read_trajectory(path)?;
+    if file.reordered > 0 {
+        let count = file.reordered;
+        eprintln!("warning: {}: {count} poses were out of order and sorted", path.display());
+    }
+    Ok(file)
+}
+
+/// Reads an estimate that can be compared with `reference`: both with stamps, or both without and
+/// of the same length.
+fn read_beside(path: &Path, reference: &TrajectoryFile) -> anyhow::Result<TrajectoryFile> {
+    let estimate = read(path)?;
+    let without_stamps = |file: &TrajectoryFile| file.format == TrajectoryFormat::Kitti;
+    let (theirs, ours) = (&reference.trajectory, &estimate.trajectory);
+    match (without_stamps(reference), without_stamps(&estimate)) {
+        (true, true) if theirs.len() != ours.len() => bail!(
+            "{}: {} poses without stamps, the reference has {}: which belong together?",
+            path.display(),
+            ours.len(),
+            theirs.len()
+        ),
+        (true, false) | (false, true) => bail!(
+            "{}: is {}, the reference is {}: only one of them has stamps",
+            path.display(),
+            estimate.format,
+            reference.format
+        ),
+        _ => Ok(estimate),
+    }
+}
+
+fn name_of(path: &Path) -> String {
+    path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}

@@ -1,0 +1,63 @@
+//! The commands: one file each, each a thin shell over the library.
+
+#[cfg(feature = "vision")]
+mod demo;
+mod evaluate;
+#[cfg(feature = "vision")]
+mod replay;
+mod simulate;
+mod terminal;
+
+use std::io::ErrorKind;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Visual-inertial odometry whose beliefs about attitude live on SO(3) itself.
+#[derive(Debug, Parser)]
+#[command(name = "mfg-vio", version, max_term_width = 100, arg_required_else_help = true)]
+struct Cli {
+    /// More messages on stderr (-v: debug, -vv: trace); RUST_LOG overrides it.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    verbose: u8,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    #[cfg(feature = "vision")]
+    Demo(demo::Args),
+    #[cfg(feature = "vision")]
+    Replay(replay::Args),
+    Simulate(simulate::SimulateArgs),
+    Evaluate(evaluate::EvaluateArgs),
+}
+
+/// Parses the command line and runs it: exit status 0, 1 after a failure, 2 on wrong usage.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    terminal::start_messages(cli.verbose);
+    let done = match cli.command {
+        #[cfg(feature = "vision")]
+        Command::Demo(args) => demo::run(&args),
+        #[cfg(feature = "vision")]
+        Command::Replay(args) => replay::run(&args),
+        Command::Simulate(args) => simulate::run(args),
+        Command::Evaluate(args) => evaluate::run(args),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("mfg-vio: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// A reader that went away (`| head`) is no failure.
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    let io = error.chain().find_map(|cause| cause.downcast_ref::<std::io::Error>());
+    io.is_some_and(|io| io.kind() == ErrorKind::BrokenPipe)
+}

@@ -1,0 +1,303 @@
+use std::path::PathBuf;
+
+use anyhow::Context;
+use indicatif::ProgressBar;
+use nalgebra::Isometry3;
+
+use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use mfg_vio::config::Config;
+use mfg_vio::dataset::{self, LogSummary};
+use mfg_vio::filter::FilterKind;
+use mfg_vio::odometry::{InitMode, StepReport};
+use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
+use mfg_vio::viewer::Contents;
+#[cfg(feature = "viewer")]
+use mfg_vio::viewer::{Recorder, Sink};
+use mfg_vio::vision::{OrbExtractor, PinholeCamera, RgbdFrame};
+
+/// Run the estimator over a log of RGB-D frames and IMU samples.
+///
+/// The format is guessed from the content: MCAP (ROS 1 or ROS 2 messages), ROS 1 bag, TUM RGB-D
+/// folder, 7-Scenes folder. With --out the directory receives trajectory.tum (pose of the body:
+/// the IMU, or the camera where there is no IMU), state.csv, metrics.json, map.ply and run.rrd.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  mfg-vio replay lab_bumper1.bag --config configs/vcu_rvi.toml \
+                        --filter mfgd --out runs/bumper1\n  rerun runs/bumper1/run.rrd")]
+pub struct Args {
+    /// The log: a file or a folder.
+    log: PathBuf,
+    #[command(flatten)]
+    settings: Settings,
+    /// Configuration of the sensor set-up; by default chosen by the log's layout.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Directory for the results.
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Where to write the Rerun recording [default: run.rrd in --out].
+    #[arg(long, value_name = "FILE")]
+    rrd: Option<PathBuf>,
+    /// Start the Rerun viewer and stream to it.
+    #[arg(long)]
+    spawn: bool,
+    /// Stream to a running Rerun viewer, e.g. rerun+http://127.0.0.1:9876/proxy.
+    #[arg(long, value_name = "URL")]
+    connect: Option<String>,
+    /// Write no recording.
+    #[arg(long, conflicts_with_all = ["rrd", "spawn", "connect"])]
+    no_recording: bool,
+    /// Skip this much of the log, s.
+    #[arg(long, value_name = "S", default_value_t = 0.0, value_parser = seconds)]
+    start: f64,
+    /// Use only this much of the log, s.
+    #[arg(long, value_name = "S", default_value_t = f64::INFINITY, hide_default_value = true, value_parser = seconds)]
+    duration: f64,
+    /// Reference trajectory (TUM, EuRoC, KITTI or VCU-RVI format) instead of the log's.
+    #[arg(long, value_name = "TRAJ")]
+    truth: Option<PathBuf>,
+    /// Print the metrics as one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What `replay` and `demo` have in common.
+#[derive(Debug, Clone, clap::Args)]
+pub struct Settings {
+    /// mfgd, mekfd (map fixed), mfgr, mekfr (map points uncertain).
+    #[arg(long, value_name = "NAME", default_value_t = FilterKind::Mfgr)]
+    filter: FilterKind,
+    /// auto, static or truth [default: init.mode of the configuration].
+    #[arg(long, value_name = "MODE")]
+    init: Option<InitMode>,
+    /// Seed of RANSAC.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// 1: everything on one thread; more: stages overlap. Results are the same.
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=64))]
+    threads: u32,
+    /// Override a key of the configuration, e.g. --set imu.gyro_noise=1e-3 (repeatable).
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+}
+
+impl Settings {
+    pub fn overrides(&self) -> &[String] {
+        &self.overrides
+    }
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value >= 0.0 => Ok(value),
+        _ => Err("expected a number of seconds, 0 or more".to_owned()),
+    }
+}
+
+pub fn run(args: &Args) -> anyhow::Result<()> {
+    catch_interrupts()?;
+    let summary = dataset::detect(&args.log)?;
+    let (config, config_origin) = load_config(args, &summary)?;
+    let plan = Plan {
+        log: &args.log,
+        settings: &args.settings,
+        config,
+        config_origin,
+        out: args.out.clone(),
+        truth: args.truth.clone(),
+        start: args.start,
+        duration: args.duration,
+        summary,
+        recording: recording_targets(args),
+    };
+    let replayed = plan.execute()?;
+    if args.json {
+        println!("{}", serde_json::to_string(&replayed.metrics)?);
+    } else {
+        print_summary(&replayed.metrics, args.out.as_deref());
+    }
+    Ok(())
+}
+
+fn load_config(args: &Args, summary: &LogSummary) -> anyhow::Result<(Config, String)> {
+    let overrides = &args.settings.overrides;
+    match &args.config {
+        Some(path) => Ok((Config::load(path, overrides)?, path.display().to_string())),
+        None => {
+            let name = &summary.config_name;
+            tracing::info!("{}: using the shipped configuration `{name}`", summary.kind);
+            Ok((Config::shipped(name, overrides)?, name.clone()))
+        }
+    }
+}
+
+/// Where a recording goes.
+#[derive(Debug, Clone)]
+pub enum Target {
+    File(PathBuf),
+    Spawn,
+    Connect(String),
+}
+
+impl Target {
+    /// The recording `run.rrd` in a directory; nothing where the program cannot record.
+    pub fn files(directory: &std::path::Path) -> Vec<Self> {
+        let file = Self::File(directory.join("run.rrd"));
+        if cfg!(feature = "viewer") { vec![file] } else { vec![] }
+    }
+}
+
+fn recording_targets(args: &Args) -> Vec<Target> {
+    let files = match (&args.rrd, &args.out) {
+        (Some(rrd), _) => vec![Target::File(rrd.clone())],
+        (None, Some(out)) if !args.no_recording => Target::files(out),
+        _ => vec![],
+    };
+    let live = args.spawn.then_some(Target::Spawn);
+    let connect = args.connect.clone().map(Target::Connect);
+    files.into_iter().chain(live).chain(connect).collect()
+}
+
+/// A replay with its recording and progress bar.
+pub struct Plan<'a> {
+    pub log: &'a std::path::Path,
+    pub settings: &'a Settings,
+    pub config: Config,
+    pub config_origin: String,
+    pub out: Option<PathBuf>,
+    pub truth: Option<PathBuf>,
+    pub start: f64,
+    pub duration: f64,
+    pub summary: LogSummary,
+    pub recording: Vec<Target>,
+}
+
+impl Plan<'_> {
+    pub fn execute(mut self) -> anyhow::Result<Replayed> {
+        if let Some(mode) = self.settings.init {
+            self.config.init.mode = mode;
+        }
+        if let Some(out) = &self.out {
+            std::fs::create_dir_all(out).with_context(|| format!("{}", out.display()))?;
+        }
+        let mut front_end =
+            OrbExtractor::new(&self.config.features, &self.config.camera, &self.config.depth)?;
+        let contents = Contents {
+            name: self
+                .log
+                .file_stem()
+                .map(|s| s.to_string_lossy().into_owned())
+                .unwrap_or_default(),
+            truth: self.truth.is_some() || self.summary.has_truth,
+            imu: self.summary.has_imu,
+        };
+        let mut bar = Bar(progress(self.summary.frames, "frames"));
+        let mut recording = Recording::start(&self.recording, &self.config, contents)?;
+        let request = Request {
+            log: self.log.to_owned(),
+            config: self.config,
+            config_origin: self.config_origin,
+            filter: self.settings.filter,
+            seed: self.settings.seed,
+            threads: self.settings.threads as usize,
+            start: self.start,
+            duration: self.duration,
+            out: self.out,
+            truth: self.truth,
+            stop: &INTERRUPTED,
+        };
+        let replayed = replay(&request, &mut front_end, &mut [&mut bar, &mut recording]);
+        bar.0.finish_and_clear();
+        recording.finish()?;
+        Ok(replayed?)
+    }
+}
+
+struct Bar(ProgressBar);
+
+impl Observer for Bar {
+    fn frame(&mut self, _: &StepReport, _: &RgbdFrame, _: Option<&Isometry3<f64>>) {
+        self.0.inc(1);
+    }
+}
+
+/// The Rerun recording of a run; nothing if none was asked for.
+struct Recording {
+    #[cfg(feature = "viewer")]
+    recorder: Option<Recorder>,
+    #[cfg(feature = "viewer")]
+    map_every: u64,
+    #[cfg(feature = "viewer")]
+    camera: Option<(PinholeCamera, Isometry3<f64>)>,
+}
+
+#[cfg(feature = "viewer")]
+impl Recording {
+    fn start(targets: &[Target], config: &Config, contents: Contents) -> anyhow::Result<Self> {
+        let sink = |target: &Target| match target {
+            Target::File(path) => Sink::File(path.clone()),
+            Target::Connect(url) => Sink::Connect(url.clone()),
+            Target::Spawn => Sink::Spawn,
+        };
+        let sinks: Vec<_> = targets.iter().map(sink).collect();
+        let recorder = match sinks.is_empty() {
+            true => None,
+            false => Some(Recorder::new(&sinks, &contents, &config.recording)?),
+        };
+        let mounting = if contents.imu { config.camera.imu_from_camera() } else { None };
+        Ok(Self {
+            recorder,
+            map_every: config.recording.map_every,
+            camera: Some(((&config.camera).into(), mounting.unwrap_or_default())),
+        })
+    }
+
+    fn finish(self) -> anyhow::Result<()> {
+        Ok(self.recorder.map(Recorder::finish).transpose().map(|_| ())?)
+    }
+}
+
+#[cfg(feature = "viewer")]
+impl Observer for Recording {
+    fn frame(&mut self, report: &StepReport, frame: &RgbdFrame, truth: Option<&Isometry3<f64>>) {
+        let Some(recorder) = &mut self.recorder else { return };
+        if let Some((camera, imu_from_camera)) = self.camera.take() {
+            let size = [frame.color.width(), frame.color.height()];
+            recorder.camera(&camera, &imu_from_camera, size);
+        }
+        recorder.frame(report, frame, truth);
+    }
+
+    fn map_every(&self) -> u64 {
+        if self.recorder.is_some() { self.map_every } else { 0 }
+    }
+}
+
+#[cfg(not(feature = "viewer"))]
+impl Recording {
+    fn start(targets: &[Target], _: &Config, _: Contents) -> anyhow::Result<Self> {
+        anyhow::ensure!(
+            targets.is_empty(),
+            "this program was built without the feature `viewer`; use --no-recording"
+        );
+        Ok(Self {})
+    }
+
+    fn finish(self) -> anyhow::Result<()> {
+        Ok(())
+    }
+}
+
+#[cfg(not(feature = "viewer"))]
+impl Observer for Recording {
+    fn frame(&mut self, _: &StepReport, _: &RgbdFrame, _: Option<&Isometry3<f64>>) {}
+}
+
+/// The result table on stdout.
+pub fn print_summary(metrics: &Metrics, out: Option<&std::path::Path>) {
+    for (what, value) in metrics.summary() {
+        println!("{what:<26} {value}");
+    }
+    if let Some(out) = out {
+        println!("{:<26} {}", "results in", out.display());
+    }
+}

@@ -1,0 +1,211 @@
+//! The configuration of a run: one TOML file a sensor set-up, single keys overridden by `--set`.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::dataset::LogConfig;
+use crate::filter::FilterConfig;
+use crate::inertial::{ImuConfig, StandstillConfig};
+use crate::map::MapConfig;
+use crate::odometry::{InitConfig, OdometryConfig, SearchConfig, TruthConfig};
+use crate::viewer::RecordingConfig;
+use crate::vision::{CameraConfig, DepthConfig, FeatureConfig, MatchingConfig, RansacConfig};
+
+/// Everything a replay can be told, by section.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    pub log: LogConfig,
+    pub imu: ImuConfig,
+    pub camera: CameraConfig,
+    pub depth: DepthConfig,
+    pub features: FeatureConfig,
+    pub search: SearchConfig,
+    pub matching: MatchingConfig,
+    pub ransac: RansacConfig,
+    pub map: MapConfig,
+    pub filter: FilterConfig,
+    pub init: InitConfig,
+    pub standstill: StandstillConfig,
+    pub truth: TruthConfig,
+    pub recording: RecordingConfig,
+}
+
+/// The configurations that come with the program, by the name a log's layout asks for.
+const SHIPPED: [(&str, &str); 4] = [
+    ("vcu_rvi", include_str!("../configs/vcu_rvi.toml")),
+    ("tum_rgbd", include_str!("../configs/tum_rgbd.toml")),
+    ("seven_scenes", include_str!("../configs/seven_scenes.toml")),
+    ("sim", include_str!("../configs/sim.toml")),
+];
+
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    #[error("{path}: {source}")]
+    Io { path: PathBuf, source: std::io::Error },
+    #[error("{origin}: {message}")]
+    Syntax { origin: String, message: String },
+    #[error("{origin}: unknown key `{key}`{}", suggestion(.nearest))]
+    UnknownKey { origin: String, key: String, nearest: Option<String> },
+    #[error("{origin}: `{key}`: {message}")]
+    BadValue { origin: String, key: String, message: String },
+    #[error("no configuration `{name}` is shipped; there are: {}", shipped_names().join(", "))]
+    NotShipped { name: String },
+    #[error("`--set {text}` is not of the form SECTION.KEY=VALUE")]
+    Override { text: String },
+}
+
+fn suggestion(nearest: &Option<String>) -> String {
+    nearest.as_ref().map(|key| format!("; did you mean `{key}`?")).unwrap_or_default()
+}
+
+pub fn shipped_names() -> Vec<&'static str> {
+    SHIPPED.iter().map(|(name, _)| *name).collect()
+}
+
+impl Config {
+    /// The configuration that is shipped under `name`, with `overrides` (`section.key=value`).
+    pub fn shipped(name: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let (_, text) = SHIPPED
+            .iter()
+            .find(|(shipped, _)| *shipped == name)
+            .ok_or_else(|| ConfigError::NotShipped { name: name.to_owned() })?;
+        Self::parse(text, &format!("configs/{name}.toml"), overrides)
+    }
+
+    /// Reads `path` and applies `overrides` (`section.key=value`).
+    pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| ConfigError::Io { path: path.to_owned(), source })?;
+        Self::parse(&text, &path.display().to_string(), overrides)
+    }
+
+    /// The sections that the pipeline behind the front end needs.
+    pub fn odometry(&self) -> OdometryConfig {
+        OdometryConfig {
+            imu: self.imu.clone(),
+            camera: self.camera.clone(),
+            search: self.search.clone(),
+            matching: self.matching.clone(),
+            ransac: self.ransac.clone(),
+            map: self.map.clone(),
+            filter: self.filter.clone(),
+            init: self.init.clone(),
+            standstill: self.standstill.clone(),
+            truth: self.truth.clone(),
+        }
+    }
+
+    fn parse(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let mut table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
+            ConfigError::Syntax { origin: origin.to_owned(), message: error.to_string() }
+        })?;
+        let valid = valid_keys()?;
+        check_keys(&table, &valid, origin)?;
+        for text in overrides {
+            apply(&mut table, text, &valid)?;
+        }
+        Self::from_table(table, origin)
+    }
+
+    fn from_table(table: toml::Table, origin: &str) -> Result<Self, ConfigError> {
+        serde_path_to_error::deserialize(toml::Value::Table(table)).map_err(|error| {
+            ConfigError::BadValue {
+                origin: origin.to_owned(),
+                key: error.path().to_string(),
+                message: error.inner().to_string().trim().to_owned(),
+            }
+        })
+    }
+}
+
+/// Every `section.key` there is, from the defaults.
+fn valid_keys() -> Result<Vec<String>, ConfigError> {
+    let defaults = toml::Table::try_from(Config::default()).map_err(|error| {
+        ConfigError::Syntax { origin: "defaults".to_owned(), message: error.to_string() }
+    })?;
+    Ok(flat_keys(&defaults))
+}
+
+fn flat_keys(table: &toml::Table) -> Vec<String> {
+    let keys_of = |(section, value): (&String, &toml::Value)| match value {
+        toml::Value::Table(keys) => {
+            keys.keys().map(|key| format!("{section}.{key}")).collect::<Vec<_>>()
+        }
+        _ => vec![section.clone()],
+    };
+    table.iter().flat_map(keys_of).collect()
+}
+
+fn check_keys(table: &toml::Table, valid: &[String], origin: &str) -> Result<(), ConfigError> {
+    flat_keys(table).iter().try_for_each(|key| check_key(key, valid, origin))
+}
+
+fn check_key(key: &str, valid: &[String], origin: &str) -> Result<(), ConfigError> {
+    if valid.iter().any(|known| known == key) {
+        return Ok(());
+    }
+    let nearest = valid
+        .iter()
+        .map(|known| (strsim::jaro_winkler(key, known), known))
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .filter(|(similarity, _)| *similarity > 0.7)
+        .map(|(_, known)| known.clone());
+    Err(ConfigError::UnknownKey { origin: origin.to_owned(), key: key.to_owned(), nearest })
+}
+
+/// Sets one key from `section.key=value`; a value that is no TOML is taken as a string.
+fn apply(table: &mut toml::Table, text: &str, valid: &[String]) -> Result<(), ConfigError> {
+    let malformed = || ConfigError::Override { text: text.to_owned() };
+    let (path, value) = text.split_once('=').ok_or_else(malformed)?;
+    let (section, key) = path.trim().split_once('.').ok_or_else(malformed)?;
+    check_key(path.trim(), valid, "--set")?;
+    let value = format!("value = {value}")
+        .parse::<toml::Table>()
+        .ok()
+        .and_then(|mut parsed| parsed.remove("value"))
+        .unwrap_or_else(|| toml::Value::String(value.trim().to_owned()));
+    let section =
+        table.entry(section.to_owned()).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+    section.as_table_mut().ok_or_else(malformed)?.insert(key.to_owned(), value);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(text: &str) -> Result<Config, ConfigError> {
+        Config::shipped("sim", &[text.to_owned()])
+    }
+
+    #[test]
+    fn every_shipped_file_is_valid_and_names_every_key() {
+        let valid = valid_keys().unwrap();
+        for (name, text) in SHIPPED {
+            Config::shipped(name, &[]).unwrap();
+            let given = flat_keys(&text.parse().unwrap());
+            let missing: Vec<_> = valid.iter().filter(|key| !given.contains(key)).collect();
+            assert!(missing.is_empty(), "{name}: {missing:?}");
+        }
+    }
+
+    #[test]
+    fn a_key_can_be_overridden() {
+        assert_eq!(set("imu.gyro_noise=1e-3").unwrap().imu.gyro_noise, 1e-3);
+        assert_eq!(set("imu.gravity=10").unwrap().imu.gravity, 10.0);
+        assert_eq!(set("log.color_topic=/my/image").unwrap().log.color_topic, "/my/image");
+    }
+
+    #[test]
+    fn mistakes_name_the_key_and_the_nearest_valid_one() {
+        let message = set("imu.gyro_nois=1").unwrap_err().to_string();
+        assert!(message.contains("imu.gyro_nois`") && message.contains("`imu.gyro_noise`"));
+        let message = set("imu.gravity=fast").unwrap_err().to_string();
+        assert!(message.contains("imu.gravity"), "{message}");
+        assert!(matches!(set("imu.gravity"), Err(ConfigError::Override { .. })));
+        assert!(matches!(set("gravity=1"), Err(ConfigError::Override { .. })));
+        assert!(matches!(Config::shipped("nope", &[]), Err(ConfigError::NotShipped { .. })));
+    }
+}

@@ -1,0 +1,73 @@
+//! One pass for the normalizing constant and all even moments of the unit quaternion.
+//!
+//! With `a_1 = s2 + s3`, `a_2 = s1 + s3`, `a_3 = s1 + s2` the density of the quaternion `x` of
+//! `Q ~ M(S)` is proportional to `exp(-2 (a_1 x1^2 + a_2 x2^2 + a_3 x3^2))`. Three routines share
+//! the plane of concentrations; none divides by differences of singular values, so repeated and
+//! opposite ones are not special.
+
+use super::forms::{Basis, CUBICS};
+use super::{concentrated, near_uniform, quadrature};
+
+/// Sums of the proper singular values: half the concentrations about the principal axes of the
+/// quaternion; `0 <= a[0] <= a[1] <= a[2]`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Sums {
+    /// `s2 + s3, s1 + s3, s1 + s2`.
+    pub a: [f64; 3],
+    /// `s2 - s3 = a[2] - a[1]`.
+    pub difference: f64,
+}
+
+impl Sums {
+    pub fn of_singular_values(s: &nalgebra::Vector3<f64>) -> Self {
+        Self { a: [s[1] + s[2], s[0] + s[2], s[0] + s[1]], difference: s[1] - s[2] }
+    }
+
+    pub fn new(a: [f64; 3]) -> Self {
+        Self { a, difference: a[2] - a[1] }
+    }
+
+    /// `S` from its sums.
+    pub fn singular_values(&self) -> nalgebra::Vector3<f64> {
+        let [a1, a2, a3] = self.a;
+        nalgebra::Vector3::new(
+            0.5 * (a2 - a1) + 0.5 * a3,
+            0.5 * (a1 + self.difference),
+            0.5 * (a1 - self.difference),
+        )
+    }
+}
+
+/// Moments of the squared quaternion components; `ORDER` 2 or 3.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct EvenMoments {
+    /// Logarithm of `c(S) exp(-tr S)`.
+    pub log_c_scaled: f64,
+    /// `E[x_i^2]`, `i = 1, 2, 3`, each accurate in relative terms.
+    pub squares: [f64; 3],
+    /// `E[x_i^2 x_j^2]`, `i, j = 1, 2, 3`, each accurate in relative terms.
+    pub products: [[f64; 3]; 3],
+    /// Cubic moments of `basis`; zero unless they were asked for.
+    pub cubics: [f64; CUBICS],
+    pub basis: Basis,
+}
+
+/// The pass: with the cubic moments if `THIRD`, else only up to the second order in `x_i^2`.
+pub(super) fn pass<const THIRD: bool>(sums: &Sums) -> EvenMoments {
+    if sums.a[0] >= concentrated::MIN_SUM {
+        concentrated::pass::<THIRD>(sums)
+    } else if sums.a[2] <= near_uniform::MAX_SUM {
+        near_uniform::pass(sums)
+    } else {
+        quadrature::pass::<THIRD>(sums)
+    }
+}
+
+/// `E[eta_i^2]` of the rotation vector `eta = log Q`.
+pub(super) fn rotation_vector_variances(sums: &Sums) -> [f64; 3] {
+    if sums.a[0] >= concentrated::MIN_SUM {
+        concentrated::rotation_vector_variances(sums)
+    } else {
+        quadrature::rotation_vector_variances(sums)
+    }
+}

@@ -1,0 +1,246 @@
+//! The matrix Fisher distribution on SO(3).
+//!
+//! # Definition
+//!
+//! `R ~ M(F)` has the density `exp(tr(F^T R))/c(F)` with respect to the normalized Haar measure
+//! (2.16). With the proper singular value decomposition `F = U S V^T`, `s1 >= s2 >= |s3|`, the
+//! rotation `Q = U^T R V ~ M(S)` is centred at the identity; `U V^T` is the mode and the mean
+//! attitude, the columns of `U` are the principal axes in the world and those of `V` in the body
+//! frame, and `s_j + s_k` is the concentration about the `i`-th of them (2.21).
+//!
+//! # How it is computed
+//!
+//! The unit quaternion `x` of `Q` has the density `exp(-2 sum_i (s_j + s_k) x_i^2)`: a Bingham
+//! distribution whose exponents are sums of singular values, never differences. One pass over
+//! it gives the exponentially scaled constant and all moments to order three ([`Moments`]); see
+//! the sources of the three routines (power series, quadrature, asymptotic series) for formulas.
+//!
+//! Measured against 40-digit arithmetic on a grid of 330 triples from 1e-6 to 1e8, both signs of
+//! `s3`, repetitions and opposites included, the largest relative errors are stated at
+//! [`Moments`].
+
+mod concentrated;
+mod engine;
+mod forms;
+mod mle;
+mod moments;
+mod near_uniform;
+mod quadrature;
+mod sampler;
+
+use nalgebra::{Matrix3, Rotation3, SMatrix, SymmetricEigen, Vector3};
+use rand::Rng;
+use rand_distr::Distribution;
+
+use crate::so3::{NotFinite, ProperSvd, proper_svd, quaternion_from_rotation};
+use engine::Sums;
+
+pub use mle::{MomentError, s_from_complement, s_from_d};
+pub use moments::Moments;
+pub use sampler::MatrixFisherSampler;
+
+/// Largest singular value; beyond it products of concentrations overflow.
+const MAX_SINGULAR_VALUE: f64 = 1e100;
+
+/// An information matrix whose smallest eigenvalue is negative by more than this fraction of the
+/// largest is refused; less is rounding.
+const NEGATIVE_INFORMATION: f64 = 1e-12;
+
+/// `S` that are not proper singular values of any matrix, or too large to compute with.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("proper singular values must satisfy 1e100 >= s1 >= s2 >= |s3|, not {0:?}")]
+pub struct InvalidSingularValues(pub [f64; 3]);
+
+/// Why a matrix Fisher distribution cannot be made.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum MatrixFisherError {
+    #[error(transparent)]
+    NotFinite(#[from] NotFinite),
+    #[error(transparent)]
+    SingularValues(#[from] InvalidSingularValues),
+    #[error(transparent)]
+    Moments(#[from] MomentError),
+    /// The attitude given as the mode is a saddle or minimum.
+    #[error("the rotation information must not be negative: its smallest eigenvalue is {0}")]
+    NegativeInformation(f64),
+}
+
+/// The matrix Fisher distribution `M(F)` on SO(3), with its moments.
+///
+/// Construction costs one pass for the moments; densities and moments are then cheap.
+///
+/// ```
+/// # use mfg_vio::distribution::matrix_fisher::MatrixFisher;
+/// # use nalgebra::{Matrix3, Vector3};
+/// let prior = MatrixFisher::new(&Matrix3::from_diagonal(&Vector3::new(20.0, 5.0, -1.0)))?;
+/// // Its mean determines it: E[R] is a sufficient statistic.
+/// let fitted = MatrixFisher::from_mean(&prior.mean())?;
+/// assert!((fitted.parameter() - prior.parameter()).norm() < 1e-11);
+/// // Independent beliefs about the same attitude multiply: their parameters add.
+/// let posterior = prior.fuse(&fitted)?;
+/// assert!(posterior.log_density(&posterior.mode()) > prior.log_density(&prior.mode()));
+/// # Ok::<(), mfg_vio::distribution::matrix_fisher::MatrixFisherError>(())
+/// ```
+#[derive(Debug, Clone, Copy)]
+pub struct MatrixFisher {
+    svd: ProperSvd,
+    moments: Moments,
+}
+
+impl MatrixFisher {
+    /// The uniform distribution, `F = 0`.
+    pub fn uniform() -> Self {
+        let identity = Rotation3::identity();
+        let s = Vector3::zeros();
+        let moments = Moments::of_ordered(&s);
+        Self { svd: ProperSvd { u: identity, s, v: identity }, moments }
+    }
+
+    /// `M(F)`.
+    pub fn new(f: &Matrix3<f64>) -> Result<Self, MatrixFisherError> {
+        Ok(Self::from_svd(proper_svd(f)?)?)
+    }
+
+    /// `M(U S V^T)` with these principal axes, which the matrix `F` alone does not determine
+    /// where singular values repeat.
+    pub fn from_svd(svd: ProperSvd) -> Result<Self, InvalidSingularValues> {
+        Ok(Self { svd, moments: Moments::new(&svd.s)? })
+    }
+
+    /// The distribution whose mean `E[R]` is `mean`: the MLE from the mean of samples.
+    pub fn from_mean(mean: &Matrix3<f64>) -> Result<Self, MatrixFisherError> {
+        let svd = proper_svd(mean)?;
+        let s = s_from_d(&svd.s)?;
+        Ok(Self::from_svd(ProperSvd { s, ..svd })?)
+    }
+
+    /// The distribution with the given mode and, at the mode, the given Hessian of minus the
+    /// log-density with respect to the body-frame rotation vector `e` of `mode exp(e^)`, 1/rad^2.
+    ///
+    /// `F = M (tr(H)/2 I - H)`, the map of FNF (31). `H` must be symmetric and not negative.
+    pub fn from_mode_and_information(
+        mode: Rotation3<f64>,
+        information: Matrix3<f64>,
+    ) -> Result<Self, MatrixFisherError> {
+        if !information.iter().all(|x| x.is_finite()) {
+            return Err(NotFinite(information).into());
+        }
+        let symmetric = 0.5 * (information + information.transpose());
+        let (axes, h) = ascending_eigenvectors(&symmetric);
+        if h[0] < -NEGATIVE_INFORMATION * h[2] || h[2] < 0.0 {
+            return Err(MatrixFisherError::NegativeInformation(h[0]));
+        }
+        let s = Sums::new([h[0].max(0.0), h[1].max(0.0), h[2]]).singular_values();
+        Ok(Self::from_svd(ProperSvd { u: mode * axes, s, v: axes })?)
+    }
+
+    /// `U`, `S`, `V` of the parameter.
+    pub fn svd(&self) -> &ProperSvd {
+        &self.svd
+    }
+
+    /// `F = U S V^T`.
+    pub fn parameter(&self) -> Matrix3<f64> {
+        self.svd.matrix()
+    }
+
+    /// The most probable attitude `U V^T`, which is also the mean attitude in the Frobenius
+    /// metric.
+    pub fn mode(&self) -> Rotation3<f64> {
+        self.svd.rotation()
+    }
+
+    /// Constant and central moments, those of `Q = U^T R V`.
+    pub fn moments(&self) -> &Moments {
+        &self.moments
+    }
+
+    /// `Q = U^T R V`, the attitude relative to the mode in principal axes.
+    pub fn centred(&self, r: &Rotation3<f64>) -> Rotation3<f64> {
+        self.svd.u.inverse() * r * self.svd.v
+    }
+
+    /// Logarithm of the density at `r` with respect to the normalized Haar measure.
+    pub fn log_density(&self, r: &Rotation3<f64>) -> f64 {
+        // tr(S Q) - tr S = -2 sum a_i x_i^2 keeps its digits where the trace has lost them.
+        let x = quaternion_from_rotation(&self.centred(r));
+        let a = Sums::of_singular_values(&self.svd.s).a;
+        let exponent: f64 = a.iter().enumerate().map(|(i, a)| a * x[i + 1] * x[i + 1]).sum();
+        -2.0 * exponent - self.moments.log_c_scaled()
+    }
+
+    /// `E[R] = U D V^T` (2.19).
+    pub fn mean(&self) -> Matrix3<f64> {
+        self.in_world(&self.moments.first())
+    }
+
+    /// `U V^T - E[R]`, to full relative accuracy at any concentration.
+    pub fn mean_complement(&self) -> Matrix3<f64> {
+        self.in_world(&self.moments.complement())
+    }
+
+    /// `E[vec R (vec R)^T]`, columns stacked.
+    pub fn second_moment(&self) -> SMatrix<f64, 9, 9> {
+        let rotation = self.svd.v.matrix().kronecker(self.svd.u.matrix());
+        rotation * self.moments.second_matrix() * rotation.transpose()
+    }
+
+    /// Hessian of minus the log-density at the mode with respect to the body-frame rotation
+    /// vector, `V (tr(S) I - S) V^T`, 1/rad^2: the inverse of
+    /// [`from_mode_and_information`](Self::from_mode_and_information).
+    pub fn information(&self) -> Matrix3<f64> {
+        self.in_body(&Sums::of_singular_values(&self.svd.s).a)
+    }
+
+    /// Covariance of the body-frame rotation vector `log(M^T R)`, rad^2.
+    ///
+    /// In the concentrated regime a series whose leading term is the inverse of
+    /// [`information`](Self::information) (theorem 2.6); elsewhere a quadrature, good to 1e-9, so
+    /// that the result is finite and right for any attitude uncertainty.
+    pub fn rotation_covariance(&self) -> Matrix3<f64> {
+        let sums = Sums::of_singular_values(&self.svd.s);
+        self.in_body(&engine::rotation_vector_variances(&sums))
+    }
+
+    /// The posterior of two independent beliefs about the same attitude: `M(F + F')`.
+    pub fn fuse(&self, other: &Self) -> Result<Self, MatrixFisherError> {
+        Self::new(&(self.parameter() + other.parameter()))
+    }
+
+    /// A sampler, prepared once for many draws.
+    pub fn sampler(&self) -> MatrixFisherSampler {
+        MatrixFisherSampler::new(&self.svd)
+    }
+
+    /// One exact sample.
+    pub fn sample<R: Rng + ?Sized>(&self, rng: &mut R) -> Rotation3<f64> {
+        self.sampler().sample(rng)
+    }
+
+    fn in_world(&self, diagonal: &Vector3<f64>) -> Matrix3<f64> {
+        ProperSvd { s: *diagonal, ..self.svd }.matrix()
+    }
+
+    fn in_body(&self, diagonal: &[f64; 3]) -> Matrix3<f64> {
+        let v = self.svd.v;
+        ProperSvd { u: v, s: Vector3::from(*diagonal), v }.matrix()
+    }
+}
+
+/// Eigenvectors as a rotation, eigenvalues ascending.
+fn ascending_eigenvectors(symmetric: &Matrix3<f64>) -> (Rotation3<f64>, [f64; 3]) {
+    let eigen = SymmetricEigen::new(*symmetric);
+    let mut order = [0, 1, 2];
+    order.sort_by(|&i, &j| eigen.eigenvalues[i].total_cmp(&eigen.eigenvalues[j]));
+    let [x, y] = [order[0], order[1]].map(|i| eigen.eigenvectors.column(i).into_owned());
+    let axes = Matrix3::from_columns(&[x, y, x.cross(&y)]);
+    (Rotation3::from_matrix_unchecked(axes), order.map(|i| eigen.eigenvalues[i]))
+}
+
+fn check_singular_values(s: &Vector3<f64>) -> Result<(), InvalidSingularValues> {
+    let valid = s[0] <= MAX_SINGULAR_VALUE && s[0] >= s[1] && s[1] >= s[2].abs();
+    valid.then_some(()).ok_or(InvalidSingularValues((*s).into()))
+}
+
+#[cfg(test)]
+mod tests;

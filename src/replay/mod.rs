@@ -1,0 +1,331 @@
+//! One replay from a log to its files and figures: the library behind `replay` and `demo`.
+
+mod metrics;
+mod outputs;
+mod report;
+
+use std::iter::Peekable;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+use nalgebra::Isometry3;
+
+pub use metrics::{Evaluation, Metrics, StageSummary};
+pub use outputs::state_columns;
+pub use report::{Series, report};
+
+use crate::config::Config;
+use crate::dataset::{self, Log, LogError};
+use crate::evaluation::{
+    Alignment, ApeOptions, AssociationOptions, EvaluationError, Relation, Trajectory, ape,
+    read_trajectory,
+};
+use crate::filter::FilterKind;
+use crate::inertial::Stamp;
+use crate::odometry::{Event, FrontEnd, Odometry, RunOptions, StepReport, TruthPose, run};
+use crate::vision::RgbdFrame;
+use metrics::{StageLog, peak_memory_bytes};
+use outputs::Outputs;
+
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    #[error(transparent)]
+    Log(#[from] LogError),
+    #[error(transparent)]
+    Evaluation(#[from] EvaluationError),
+    #[error("{path}: {source}")]
+    Write { path: PathBuf, source: std::io::Error },
+    #[error(
+        "`camera.imu_from_camera` is no rigid motion (rotation and translation, row-major 4x4)"
+    )]
+    Extrinsics,
+    #[error("the front end cannot start: {0}")]
+    FrontEnd(String),
+    #[error("the recording failed: {0}")]
+    Recording(String),
+    #[error("{log}: no frame was processed: {reason}")]
+    NothingProcessed { log: PathBuf, reason: String },
+}
+
+/// What a replay is asked for.
+pub struct Request<'a> {
+    pub log: PathBuf,
+    pub config: Config,
+    /// File or shipped name that `config` came from.
+    pub config_origin: String,
+    pub filter: FilterKind,
+    pub seed: u64,
+    pub threads: usize,
+    /// Part of the log, s.
+    pub start: f64,
+    pub duration: f64,
+    /// Directory for the output files.
+    pub out: Option<PathBuf>,
+    /// Reference trajectory that replaces the log's.
+    pub truth: Option<PathBuf>,
+    pub stop: &'a AtomicBool,
+}
+
+/// Sees every frame with its report while a replay runs.
+pub trait Observer {
+    /// `truth` is the reference pose at the frame, moved so that it starts where the estimate
+    /// starts.
+    fn frame(&mut self, report: &StepReport, frame: &RgbdFrame, truth: Option<&Isometry3<f64>>);
+
+    /// Every how many frames a report should carry the map; 0: never.
+    fn map_every(&self) -> u64 {
+        0
+    }
+}
+
+/// A replay's figures and the series that reports are drawn from.
+pub struct Replayed {
+    pub metrics: Metrics,
+    pub series: Series,
+    pub estimate: Option<Trajectory>,
+    pub reference: Option<Trajectory>,
+}
+
+/// Replays a log. Files in `request.out` are valid whenever it returns, also when it was stopped.
+pub fn replay(
+    request: &Request,
+    front_end: &mut dyn FrontEnd,
+    observers: &mut [&mut dyn Observer],
+) -> Result<Replayed, ReplayError> {
+    let config = &request.config;
+    let mut log = dataset::open(&request.log, &config.log, &config.imu)?;
+    let summary = log.summary().clone();
+    for (role, source) in &summary.sources {
+        tracing::info!("{role}: {source}");
+    }
+    let mut odometry =
+        Odometry::new(&config.odometry(), request.filter, request.seed, summary.has_imu)
+            .ok_or(ReplayError::Extrinsics)?;
+    let map_every = observers.iter().map(|observer| observer.map_every()).filter(|n| *n > 0).min();
+    odometry.report_map_every(map_every.unwrap_or(0));
+    let mut session = Session {
+        outputs: request.out.as_deref().map(Outputs::create).transpose()?,
+        failure: None,
+        stages: StageLog::default(),
+        series: Series::default(),
+        estimate: Vec::new(),
+        estimate_from_reference: None,
+        truth_max_gap: config.truth.max_gap,
+    };
+    let mut truth = Vec::new();
+    let given = request.truth.as_deref().map(given_truth).transpose()?;
+    let options = RunOptions {
+        threads: request.threads,
+        start: request.start,
+        duration: request.duration,
+        stop: request.stop,
+    };
+
+    let (clock, cpu_clock) = (Instant::now(), cpu_time::ProcessTime::now());
+    let given = given.map(Iterator::peekable);
+    let events = EventSource { log: log.as_mut(), given, pending: None, truth: &mut truth };
+    let mut span = Span::default();
+    run(events, front_end, &mut odometry, options, |report, frame, odometry| {
+        span.extend(report.stamp);
+        session.step(&report, frame, odometry, observers);
+    });
+    let wall_seconds = clock.elapsed().as_secs_f64();
+    let cpu_seconds = cpu_clock.elapsed().as_secs_f64();
+
+    session.finish_outputs(&odometry)?;
+    let stats = odometry.stats();
+    let estimate = trajectory(&session.estimate);
+    let reference = trajectory(&shifted(&truth, config.truth.time_offset));
+    if estimate.is_none() {
+        let reason = stats.waiting_reason.unwrap_or_else(|| "the log has none".to_owned());
+        return Err(ReplayError::NothingProcessed { log: request.log.clone(), reason });
+    }
+    let evaluated = match (&reference, &estimate) {
+        (Some(reference), Some(estimate)) => Some(evaluate(reference, estimate)),
+        _ => None,
+    };
+    let (evaluation, evaluation_failure) = match evaluated {
+        Some(Ok(evaluation)) => (Some(evaluation), None),
+        Some(Err(error)) => (None, Some(error.to_string())),
+        None => (None, None),
+    };
+    let metrics = Metrics {
+        log: request.log.display().to_string(),
+        log_kind: summary.kind,
+        config: request.config_origin.clone(),
+        filter: request.filter.to_string(),
+        init: config.init.mode.to_string(),
+        seed: request.seed,
+        threads: request.threads,
+        sources: summary.sources,
+        has_imu: summary.has_imu,
+        read: log.report().clone(),
+        odometry: stats,
+        interrupted: request.stop.load(std::sync::atomic::Ordering::Relaxed),
+        log_seconds: span.seconds(),
+        wall_seconds,
+        cpu_seconds,
+        real_time_factor: span.seconds() / wall_seconds.max(1e-9),
+        peak_memory_bytes: peak_memory_bytes(),
+        stages: session.stages.summary(),
+        path_length: path_length(&session.estimate),
+        evaluation,
+        evaluation_failure,
+    };
+    if let Some(directory) = &request.out {
+        write_metrics(directory, &metrics)?;
+    }
+    Ok(Replayed { metrics, series: session.series, estimate, reference })
+}
+
+/// APE of position and attitude after SE(3) alignment, as `evaluate ape --align se3`.
+fn evaluate(reference: &Trajectory, estimate: &Trajectory) -> Result<Evaluation, EvaluationError> {
+    let options = |relation| ApeOptions {
+        association: AssociationOptions::default(),
+        alignment: Alignment::Se3,
+        align_n: None,
+        relation,
+    };
+    let translation = ape(reference, estimate, &options(Relation::Translation))?;
+    let rotation = ape(reference, estimate, &options(Relation::Angle))?;
+    Ok(Evaluation::new(&translation, &rotation))
+}
+
+fn given_truth(path: &Path) -> Result<std::vec::IntoIter<TruthPose>, ReplayError> {
+    let trajectory = read_trajectory(path)?.trajectory;
+    let poses: Vec<_> = trajectory
+        .stamps()
+        .iter()
+        .zip(trajectory.poses())
+        .filter_map(|(seconds, pose)| {
+            Some(TruthPose { stamp: Stamp::from_seconds(*seconds)?, world_from_body: *pose })
+        })
+        .collect();
+    Ok(poses.into_iter())
+}
+
+fn shifted(poses: &[TruthPose], seconds: f64) -> Vec<TruthPose> {
+    poses.iter().map(|pose| TruthPose { stamp: pose.stamp.offset_by(seconds), ..*pose }).collect()
+}
+
+/// `None` if there are no poses.
+fn trajectory(poses: &[TruthPose]) -> Option<Trajectory> {
+    let stamps = poses.iter().map(|pose| pose.stamp.seconds()).collect();
+    Trajectory::new(stamps, poses.iter().map(|pose| pose.world_from_body).collect()).ok()
+}
+
+fn path_length(poses: &[TruthPose]) -> f64 {
+    let position = |pose: &TruthPose| pose.world_from_body.translation.vector;
+    poses.windows(2).map(|pair| (position(&pair[1]) - position(&pair[0])).norm()).sum()
+}
+
+fn write_metrics(directory: &Path, metrics: &Metrics) -> Result<(), ReplayError> {
+    let path = directory.join("metrics.json");
+    let text = serde_json::to_string_pretty(metrics).map_err(std::io::Error::other);
+    text.and_then(|text| std::fs::write(&path, text + "\n"))
+        .map_err(|source| ReplayError::Write { path, source })
+}
+
+/// First and last stamp seen.
+#[derive(Debug, Clone, Copy, Default)]
+struct Span(Option<(Stamp, Stamp)>);
+
+impl Span {
+    fn extend(&mut self, stamp: Stamp) {
+        self.0 = Some(self.0.map_or((stamp, stamp), |(first, last)| (first, last.max(stamp))));
+    }
+
+    fn seconds(self) -> f64 {
+        self.0.map_or(0.0, |(first, last)| last.seconds_since(first))
+    }
+}
+
+/// The log's events; the reference poses among them are noted, or replaced by given ones.
+struct EventSource<'a> {
+    log: &'a mut dyn Log,
+    given: Option<Peekable<std::vec::IntoIter<TruthPose>>>,
+    /// The log's next event, while given poses go before it.
+    pending: Option<Event>,
+    truth: &'a mut Vec<TruthPose>,
+}
+
+impl EventSource<'_> {
+    fn next_of_log(&mut self) -> Option<Event> {
+        let replaced = self.given.is_some();
+        std::iter::from_fn(|| self.log.next_event())
+            .find(|event| !(replaced && matches!(event, Event::Truth(_))))
+    }
+}
+
+impl Iterator for EventSource<'_> {
+    type Item = Event;
+
+    fn next(&mut self) -> Option<Event> {
+        let event = match self.pending.take() {
+            Some(event) => event,
+            None => self.next_of_log()?,
+        };
+        let due = |pose: &TruthPose| pose.stamp <= event.stamp();
+        let given = self.given.as_mut().and_then(|poses| poses.next_if(due));
+        let event = match given {
+            Some(pose) => {
+                self.pending = Some(event);
+                Event::Truth(pose)
+            }
+            None => event,
+        };
+        if let Event::Truth(pose) = &event {
+            self.truth.push(*pose);
+        }
+        Some(event)
+    }
+}
+
+/// What is gathered while the frames go by.
+struct Session {
+    outputs: Option<Outputs>,
+    failure: Option<ReplayError>,
+    stages: StageLog,
+    series: Series,
+    estimate: Vec<TruthPose>,
+    /// Moves the reference to where the estimate starts; fixed at the first frame that has both.
+    estimate_from_reference: Option<Isometry3<f64>>,
+    truth_max_gap: f64,
+}
+
+impl Session {
+    fn step(
+        &mut self,
+        report: &StepReport,
+        frame: &RgbdFrame,
+        odometry: &Odometry,
+        observers: &mut [&mut dyn Observer],
+    ) {
+        self.stages.push(&report.times);
+        self.series.push(report);
+        let estimate = report.state.world_from_body;
+        self.estimate.push(TruthPose { stamp: report.stamp, world_from_body: estimate });
+        if let (Some(outputs), None) = (&mut self.outputs, &self.failure) {
+            self.failure = outputs.step(report).err();
+        }
+        let reference = odometry.truth().at(report.stamp, self.truth_max_gap);
+        if let (Some(reference), None) = (reference, self.estimate_from_reference) {
+            self.estimate_from_reference = Some(estimate * reference.inverse());
+        }
+        let moved = self.estimate_from_reference.zip(reference).map(|(by, pose)| by * pose);
+        for observer in observers {
+            observer.frame(report, frame, moved.as_ref());
+        }
+    }
+
+    fn finish_outputs(&mut self, odometry: &Odometry) -> Result<(), ReplayError> {
+        if let Some(failure) = self.failure.take() {
+            return Err(failure);
+        }
+        match self.outputs.take() {
+            Some(outputs) => outputs.finish(&odometry.map()),
+            None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! The files of `replay --out DIR`: `trajectory.tum`, `state.csv`, `map.ply`.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use super::ReplayError;
+use crate::inertial::block;
+use crate::odometry::{MapPointView, StepReport};
+
+/// Writes trajectory and state line by line, so that an interrupted run leaves valid files.
+pub struct Outputs {
+    trajectory: OutputFile,
+    state: OutputFile,
+    directory: PathBuf,
+}
+
+struct OutputFile {
+    path: PathBuf,
+    writer: BufWriter<File>,
+}
+
+impl OutputFile {
+    fn create(path: PathBuf) -> Result<Self, ReplayError> {
+        match File::create(&path) {
+            Ok(file) => Ok(Self { path, writer: BufWriter::new(file) }),
+            Err(source) => Err(ReplayError::Write { path, source }),
+        }
+    }
+
+    fn line(&mut self, line: &str) -> Result<(), ReplayError> {
+        writeln!(self.writer, "{line}")
+            .map_err(|source| ReplayError::Write { path: self.path.clone(), source })
+    }
+
+    fn finish(mut self) -> Result<(), ReplayError> {
+        self.writer.flush().map_err(|source| ReplayError::Write { path: self.path, source })
+    }
+}
+
+impl Outputs {
+    /// Creates `directory` and the files in it.
+    pub fn create(directory: &Path) -> Result<Self, ReplayError> {
+        std::fs::create_dir_all(directory)
+            .map_err(|source| ReplayError::Write { path: directory.to_owned(), source })?;
+        let trajectory = OutputFile::create(directory.join("trajectory.tum"))?;
+        let mut state = OutputFile::create(directory.join("state.csv"))?;
+        state.line(&state_columns().join(","))?;
+        Ok(Self { trajectory, state, directory: directory.to_owned() })
+    }
+
+    pub fn step(&mut self, report: &StepReport) -> Result<(), ReplayError> {
+        self.trajectory.line(&trajectory_line(report))?;
+        self.state.line(&state_line(report))
+    }
+
+    pub fn finish(self, map: &[MapPointView]) -> Result<(), ReplayError> {
+        write_map(&self.directory.join("map.ply"), map)?;
+        self.trajectory.finish()?;
+        self.state.finish()
+    }
+}
+
+/// `timestamp tx ty tz qx qy qz qw` of the body.
+fn trajectory_line(report: &StepReport) -> String {
+    let pose = &report.state.world_from_body;
+    let (t, q) = (pose.translation.vector, pose.rotation.coords);
+    let stamp = report.stamp;
+    format!("{stamp} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9}", t.x, t.y, t.z, q.x, q.y, q.z, q.w)
+}
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+const COVARIANCE_BLOCKS: [(&str, usize); 5] = [
+    ("var_rot", block::ROTATION),
+    ("var_vel", block::VELOCITY),
+    ("var_pos", block::POSITION),
+    ("var_gyro_bias", block::GYRO_BIAS),
+    ("var_accel_bias", block::ACCEL_BIAS),
+];
+/// Indices of (rotation, position) in the covariance.
+const POSE: [usize; 6] = [
+    block::ROTATION,
+    block::ROTATION + 1,
+    block::ROTATION + 2,
+    block::POSITION,
+    block::POSITION + 1,
+    block::POSITION + 2,
+];
+
+/// Names of the columns of `state.csv`, in order; see `docs` of the command for their meaning.
+pub fn state_columns() -> Vec<String> {
+    let axes = |stem: &str| AXES.map(|axis| format!("{stem}_{axis}")).to_vec();
+    let mut columns = vec!["time".to_owned()];
+    columns.extend(["px", "py", "pz", "qx", "qy", "qz", "qw"].map(str::to_owned));
+    for stem in ["vel", "gyro_bias", "accel_bias"] {
+        columns.extend(axes(stem));
+    }
+    for (stem, _) in COVARIANCE_BLOCKS {
+        columns.extend(axes(stem));
+    }
+    for row in 0..6 {
+        columns.extend((0..6).map(|column| format!("cov_pose_{row}{column}")));
+    }
+    columns.extend(["s1", "s2", "s3", "innovation"].map(str::to_owned));
+    columns.extend(
+        ["features", "with_depth", "candidates", "matches", "inliers", "new_points", "map_points"]
+            .map(str::to_owned),
+    );
+    let stages = crate::odometry::StageTimes::default().stages();
+    columns.extend(stages.map(|(stage, _)| format!("time_{stage}")));
+    columns
+}
+
+/// One line of `state.csv`; a value that a filter does not have is left empty.
+fn state_line(report: &StepReport) -> String {
+    let state = &report.state;
+    let pose = &state.world_from_body;
+    let mut values = Vec::with_capacity(96);
+    values.extend(pose.translation.vector.iter().chain(pose.rotation.coords.iter()));
+    for vector in [&state.velocity, &state.gyro_bias, &state.accel_bias] {
+        values.extend(vector.iter());
+    }
+    for (_, start) in COVARIANCE_BLOCKS {
+        values.extend((start..start + 3).map(|k| report.covariance[(k, k)]));
+    }
+    for row in POSE {
+        values.extend(POSE.map(|column| report.covariance[(row, column)]));
+    }
+    let mut fields = vec![report.stamp.to_string()];
+    fields.extend(values.iter().map(|value| format!("{value:.9e}")));
+    let s = report.matrix_fisher_s;
+    let optional = (0..3).map(|k| s.map(|s| s[k])).chain([report.innovation]);
+    fields.extend(optional.map(|v| v.map(|v| format!("{v:.9e}")).unwrap_or_default()));
+    let c = &report.counts;
+    let counts =
+        [c.features, c.with_depth, c.candidates, c.matches, c.inliers, c.new_points, c.map_points];
+    fields.extend(counts.map(|count| count.to_string()));
+    fields.extend(report.times.stages().map(|(_, seconds)| format!("{seconds:.6}")));
+    fields.join(",")
+}
+
+/// ASCII PLY of the map points: position (m, world), `sigma` (m), `age` (frames).
+fn write_map(path: &Path, map: &[MapPointView]) -> Result<(), ReplayError> {
+    let mut file = OutputFile::create(path.to_owned())?;
+    file.line("ply\nformat ascii 1.0")?;
+    file.line(&format!("element vertex {}", map.len()))?;
+    for property in ["float x", "float y", "float z", "float sigma", "uint age"] {
+        file.line(&format!("property {property}"))?;
+    }
+    file.line("end_header")?;
+    for point in map {
+        let [x, y, z] = point.position;
+        file.line(&format!("{x} {y} {z} {} {}", point.sigma, point.age))?;
+    }
+    file.finish()
+}
