@@ -62,11 +62,10 @@ fn nearest_rotation(m: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
     let (u, v_t) = (svd.u?, svd.v_t?);
     let sign = (u * v_t).determinant().signum();
     let s = svd.singular_values;
-    if !(s[1] + sign * s[2] > MIN_CONDITION * s[0]) {
-        return None;
-    }
+    let unique = s[1] + sign * s[2] > MIN_CONDITION * s[0];
     let rotation = u * Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign)) * v_t;
-    Some(UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation)))
+    let rotation = Rotation3::from_matrix_unchecked(rotation);
+    unique.then(|| UnitQuaternion::from_rotation_matrix(&rotation))
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! ROS 1 bags, read record by record from the start: an index is neither needed nor trusted.
+//! ROS 1 bags, read record by record from the start; an index only tells the topics beforehand.
 //!
 //! Format: <http://wiki.ros.org/Bags/Format/2.0>.
 

@@ -1,4 +1,4 @@
-//! MCAP files, read record by record from the start: an index is neither needed nor trusted.
+//! MCAP files, read record by record from the start; an index only tells the topics beforehand.
 //!
 //! Format: <https://mcap.dev/spec>. The readers of the crate `mcap` want the whole file mapped or
 //! overflow on damaged lengths; of it, only the records are used here.

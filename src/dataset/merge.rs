@@ -97,6 +97,8 @@ impl<S: ReadingSource> MergedLog<S> {
         for reading in self.gates[stream].pass(reading, &mut self.report) {
             self.buffer.add(reading, &mut self.report);
         }
+        let held = self.gates.iter().filter_map(|gate| gate.held.as_ref().map(Reading::stamp));
+        self.buffer.advance(held, &mut self.report);
     }
 
     fn finish(&mut self) {
@@ -236,9 +238,16 @@ impl ReorderBuffer {
         }
         self.size += size;
         self.latest = self.latest.max(stamp);
-        let mut until = Stamp::from_nanos(self.latest.nanos().saturating_sub(self.delay));
+    }
+
+    /// Releases what need not wait any longer, for stragglers or for the readings `held` back.
+    fn advance(&mut self, held: impl Iterator<Item = Stamp>, report: &mut ReadReport) {
+        let due = Stamp::from_nanos(self.latest.nanos().saturating_sub(self.delay));
+        let believable = |held: &Stamp| self.latest.seconds_since(*held) <= LONGEST_STEP;
+        let before = |held: Stamp| Stamp::from_nanos(held.nanos().saturating_sub(1));
+        let mut until = held.filter(believable).map(before).fold(due, Stamp::min);
         if self.size > LARGEST_BUFFER {
-            until = until.max(self.latest);
+            until = self.latest;
         }
         if self.oldest().is_some_and(|oldest| oldest <= until) {
             self.release(until, report);
@@ -402,6 +411,15 @@ mod tests {
     }
 
     #[test]
+    fn a_slow_stream_is_not_late_while_its_first_stamp_waits_for_the_second() {
+        let readings: Vec<_> = (0..300)
+            .flat_map(|n| if n % 100 == 0 { vec![truth(n), imu(n)] } else { vec![imu(n)] })
+            .collect();
+        let (events, skipped) = merge(readings, 0.01);
+        assert_eq!((events.len(), skipped.len()), (303, 0));
+    }
+
+    #[test]
     fn a_pause_of_the_recording_loses_nothing() {
         let readings: Vec<_> =
             (0..50).chain(60_000..60_050).flat_map(|n| [imu(n), truth(n)]).collect();
@@ -424,6 +442,7 @@ mod tests {
         let mut report = ReadReport::default();
         for n in 0..40 {
             buffer.add(color(n, 16 << 20), &mut report);
+            buffer.advance(std::iter::empty(), &mut report);
             assert!(buffer.size <= LARGEST_BUFFER);
         }
     }

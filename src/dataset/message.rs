@@ -180,10 +180,6 @@ pub(super) fn compressed_image<'a>(
 }
 
 impl<'a> CompressedImage<'a> {
-    pub fn is_depth(&self) -> bool {
-        is_depth_format(self.format)
-    }
-
     /// The PNG of a depth image; `compressedDepth` puts a header of 12 bytes before it.
     pub fn depth_file(&self) -> Result<&'a [u8], Rejection> {
         if self.format.contains("compressedDepth") {

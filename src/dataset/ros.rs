@@ -95,7 +95,7 @@ const SURVEY_MESSAGES: usize = 10_000;
 const SURVEY_BYTES: usize = 64 << 20;
 
 /// IMU samples looked at to tell g from m/s^2.
-const SURVEY_IMU_SAMPLES: usize = 50;
+const SURVEY_IMU_SAMPLES: usize = 10;
 
 /// Median specific force below this is taken for g, above for m/s^2.
 const LARGEST_MEDIAN_IN_G: f64 = 4.0;

@@ -40,8 +40,8 @@ pub use nees::{
     BelievedTrajectory, NeesOptions, NeesResult, NeesSummary, nees, read_believed_trajectory,
 };
 pub use plot::{Band, BoxPanel, Curve, CurvePanel, Figure, Panel, PathPanel, PlotError};
-pub use report::{Report, write_html};
 pub use relative::{Delta, RpeOptions, RpeResult, rpe};
+pub use report::{Report, write_html};
 pub use statistics::Statistics;
 pub use sub_trajectory::{SubTrajectoryError, sub_trajectory_errors};
 pub use table::{Cell, Table};

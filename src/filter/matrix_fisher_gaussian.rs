@@ -337,7 +337,7 @@ mod tests {
             let mut constant = None;
             for _ in 0..10 {
                 let r = Rotation3::new(random_vector(&mut rng, 2.0));
-                let x = SVector::from_fn(|_, _| rng.random_range(-2.0..2.0));
+                let x = SVector::<f64, EUCLIDEAN>::from_fn(|_, _| rng.random_range(-2.0..2.0));
                 let t = origin + x.fixed_rows::<3>(POSITION);
                 let bayes = log_density(&before, &r, &x) - 0.5 * likelihood.cost(&r, &t);
                 let difference = log_density(&after, &r, &x) - bayes;

@@ -124,8 +124,8 @@ impl Default for FilterConfig {
             moving_tilt_sd_deg: 5.0,
             heading_sd_deg: 0.1,
             moving_velocity_sd: 1.0,
-            angular_acceleration: 5.0,
-            acceleration: 5.0,
+            angular_acceleration: 3.0,
+            acceleration: 3.0,
             angular_velocity_sd: 1.0,
         }
     }

@@ -207,7 +207,7 @@ mod tests {
     }
 
     fn error(from: &NavState, to: &NavState) -> SVector<f64, 15> {
-        let mut error = SVector::zeros();
+        let mut error = SVector::<f64, 15>::zeros();
         let mut set =
             |start, value: Vector3<f64>| error.fixed_rows_mut::<3>(start).copy_from(&value);
         let turn = from.world_from_body.rotation.inverse() * to.world_from_body.rotation;

@@ -7,11 +7,15 @@
 use rerun::external::re_log_types::{BlueprintActivationCommand, StoreId, StoreKind};
 use rerun::external::re_sdk_types::View;
 use rerun::external::re_sdk_types::blueprint::archetypes::{
-    ContainerBlueprint, LineGrid3D, PanelBlueprint, PlotLegend, TimePanelBlueprint, ViewBlueprint,
-    ViewContents, ViewportBlueprint, VisibleTimeRanges,
+    Background, ContainerBlueprint, LineGrid3D, PanelBlueprint, PlotLegend, TextLogColumns,
+    TimeAxis, TimePanelBlueprint, ViewBlueprint, ViewContents, ViewportBlueprint,
+    VisibleTimeRanges,
 };
 use rerun::external::re_sdk_types::blueprint::components::{
-    ContainerKind, Corner2D, PanelState, VisibleTimeRange,
+    BackgroundKind, ContainerKind, Corner2D, PanelState, PlayState, TimeRange, VisibleTimeRange,
+};
+use rerun::external::re_sdk_types::blueprint::datatypes::{
+    TextLogColumn, TextLogColumnKind, TimelineColumn,
 };
 use rerun::external::re_sdk_types::blueprint::views::{
     Spatial2DView, Spatial3DView, TextLogView, TimeSeriesView,
@@ -26,6 +30,8 @@ use super::Contents;
 use super::plots::{self, Plot, Tab};
 use super::scene;
 use super::timeline::{FRAME, TIME};
+
+const BACKGROUND: [u8; 3] = [18, 20, 26];
 
 /// Makes the layout part of the recording, as the one to open with.
 pub(super) fn send(
@@ -82,7 +88,7 @@ impl Layout {
         }
         tabs.push((self.tab(&plots::TIMES)?, 1.0));
         let plots = self.container(ContainerKind::Tabs, "Plots", &tabs)?;
-        let log = self.view::<TextLogView>("Log", scene::LOG, &["+ $origin/**".to_owned()])?;
+        let log = self.log_view()?;
         let below = self.container(
             ContainerKind::Horizontal,
             "Plots and log",
@@ -99,8 +105,11 @@ impl Layout {
         for panel in ["blueprint_panel", "selection_panel"] {
             self.stream.log(panel, &PanelBlueprint::new().with_state(PanelState::Collapsed))?;
         }
-        let time_panel =
-            TimePanelBlueprint::new().with_state(PanelState::Collapsed).with_timeline(TIME);
+        // At the end of a file the whole run is in sight; a live view keeps up.
+        let time_panel = TimePanelBlueprint::new()
+            .with_state(PanelState::Collapsed)
+            .with_timeline(TIME)
+            .with_play_state(PlayState::Following);
         self.stream.log("time_panel", &time_panel)
     }
 
@@ -115,12 +124,28 @@ impl Layout {
                 format!("- {}/**", scene::KEYPOINTS),
             ],
         )?;
+        self.property(&world, &Background::new(BackgroundKind::SolidColor).with_color(BACKGROUND))?;
         self.property(&world, &LineGrid3D::new().with_visible(true))?;
         for trajectory in scene::TRAJECTORIES {
-            let path = format!("{}/ViewContents/overrides/{trajectory}", world.path);
+            let path = ViewContents::blueprint_base_visualizer_path_for_entity(
+                world.id,
+                &trajectory.into(),
+            );
             self.stream.log(path, &VisibleTimeRanges::new([TIME, FRAME].map(up_to_cursor)))?;
         }
         Ok(world)
+    }
+
+    fn log_view(&mut self) -> RecordingStreamResult<Node> {
+        let log = self.view::<TextLogView>("Log", scene::LOG, &["+ $origin/**".to_owned()])?;
+        // Not the entity's path, which is always the same.
+        let columns = [TextLogColumnKind::LogLevel, TextLogColumnKind::Body];
+        let columns = columns.map(|kind| TextLogColumn { visible: true.into(), kind });
+        let frame = TimelineColumn { visible: true.into(), timeline: FRAME.into() };
+        let columns =
+            TextLogColumns::new().with_timeline_columns([frame]).with_text_log_columns(columns);
+        self.property(&log, &columns)?;
+        Ok(log)
     }
 
     fn tab(&mut self, tab: &Tab) -> RecordingStreamResult<Node> {
@@ -135,6 +160,8 @@ impl Layout {
     fn plot(&mut self, plot: &Plot) -> RecordingStreamResult<Node> {
         let view =
             self.view::<TimeSeriesView>(plot.title, plot.entity, &["+ $origin".to_owned()])?;
+        let whole = TimeRange(datatypes::TimeRange::EVERYTHING);
+        self.property(&view, &TimeAxis::new().with_view_range(whole))?;
         self.property(&view, &PlotLegend::new().with_corner(Corner2D::LeftTop))?;
         Ok(view)
     }

@@ -4,7 +4,6 @@ use nalgebra::{Isometry3, Vector3};
 use rerun::{RecordingStream, RecordingStreamResult, Scalars, SeriesLines};
 
 use super::covariance::{principal_axes, standard_deviations};
-use super::timeline::Clock;
 use crate::inertial::ImuSample;
 use crate::inertial::block;
 use crate::odometry::StepReport;
@@ -29,7 +28,7 @@ const fn line(name: &'static str, [r, g, b]: [u8; 3]) -> Series {
 
 /// A bound or a reference: thinner and fainter than the line it belongs to.
 const fn bound(name: &'static str, [r, g, b]: [u8; 3]) -> Series {
-    Series { name, color: [r, g, b, 110], width: 1.0 }
+    Series { name, color: [r, g, b, 170], width: 1.0 }
 }
 
 const X: [u8; 3] = [240, 90, 90];
@@ -42,7 +41,7 @@ const GREEN: [u8; 3] = [100, 220, 120];
 const RED: [u8; 3] = [240, 80, 80];
 const VIOLET: [u8; 3] = [190, 130, 255];
 const CYAN: [u8; 3] = [90, 220, 220];
-const GREY: [u8; 3] = [170, 170, 170];
+const GREY: [u8; 3] = [190, 190, 190];
 
 const AXES: &[Series] = &[line("x", X), line("y", Y), line("z", Z)];
 const AXES_WITH_BANDS: &[Series] = &[
@@ -157,10 +156,7 @@ pub(super) fn log_report(
     report: &StepReport,
     truth: Option<&Isometry3<f64>>,
 ) -> RecordingStreamResult<()> {
-    let log = |plot: &Plot, values: &[f64]| {
-        debug_assert_eq!(plot.series.len(), values.len(), "{}", plot.entity);
-        stream.log(plot.entity, &Scalars::new(values.iter().copied()))
-    };
+    let log = |plot: &Plot, values: &[f64]| log(stream, plot, values);
     let sigma = |block| standard_deviations(&report.covariance, block);
     let degrees = |radians: Vector3<f64>| radians.map(f64::to_degrees);
 
@@ -196,23 +192,15 @@ pub(super) fn log_report(
     log(&TIMING, &stage_milliseconds(report))
 }
 
-/// IMU samples at their own stamps, in one batch.
-pub(super) fn log_imu(
-    stream: &RecordingStream,
-    clock: Clock,
-    samples: &[ImuSample],
-) -> RecordingStreamResult<()> {
-    let send = |plot: &Plot, reading: fn(&ImuSample) -> Vector3<f64>| {
-        let values = samples.iter().flat_map(|sample| <[f64; 3]>::from(reading(sample)));
-        let columns = Scalars::new(values).columns(vec![3; samples.len()])?;
-        let times = clock.column(samples.iter().map(|sample| sample.stamp));
-        stream.send_columns(plot.entity, [times], columns)
-    };
-    if samples.is_empty() {
-        return Ok(());
-    }
-    send(&ANGULAR_VELOCITY, |sample| sample.angular_velocity.map(f64::to_degrees))?;
-    send(&SPECIFIC_FORCE, |sample| sample.specific_force)
+/// A sample of the IMU, at the stream's current time.
+pub(super) fn log_imu(stream: &RecordingStream, sample: &ImuSample) -> RecordingStreamResult<()> {
+    log(stream, &ANGULAR_VELOCITY, sample.angular_velocity.map(f64::to_degrees).as_slice())?;
+    log(stream, &SPECIFIC_FORCE, sample.specific_force.as_slice())
+}
+
+fn log(stream: &RecordingStream, plot: &Plot, values: &[f64]) -> RecordingStreamResult<()> {
+    debug_assert_eq!(plot.series.len(), values.len(), "{}", plot.entity);
+    stream.log(plot.entity, &Scalars::new(values.iter().copied()))
 }
 
 /// Error and largest 3 sigma of the position (m) and of the attitude (rad).

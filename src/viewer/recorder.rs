@@ -68,7 +68,6 @@ pub struct Recorder {
 enum Message {
     Camera { camera: PinholeCamera, imu_from_camera: Isometry3<f64>, size: [usize; 2] },
     Frame(Box<Frame>),
-    Imu(Vec<ImuSample>),
 }
 
 #[derive(Debug)]
@@ -132,7 +131,8 @@ impl Recorder {
         self.send(Message::Camera { camera, imu_from_camera, size });
     }
 
-    /// A sample of the IMU, bias and noise included. Call it in the order of the stamps.
+    /// A sample of the IMU, bias and noise included, in the order of the stamps. It is recorded
+    /// with the next frame.
     pub fn imu(&mut self, sample: &ImuSample) {
         if is_due(self.imu_samples, self.config.imu_every) {
             self.imu.push(*sample);
@@ -147,18 +147,8 @@ impl Recorder {
         images: &RgbdFrame,
         truth: Option<&Isometry3<f64>>,
     ) {
-        let color = is_due(self.frames, self.config.image_every).then(|| images.color.clone());
-        let depth = is_due(self.frames, self.config.depth_every).then(|| images.depth.clone());
-        let imu = std::mem::take(&mut self.imu);
-        self.frames += 1;
-        let report = report.clone();
-        self.send(Message::Frame(Box::new(Frame {
-            report,
-            truth: truth.copied(),
-            imu,
-            color,
-            depth,
-        })));
+        let message = self.frame_message(report, images, truth);
+        self.send(message);
     }
 
     /// Writes what is left and closes the recording; a file then has its footer.
@@ -169,24 +159,43 @@ impl Recorder {
         self.close()
     }
 
+    fn frame_message(
+        &mut self,
+        report: &StepReport,
+        images: &RgbdFrame,
+        truth: Option<&Isometry3<f64>>,
+    ) -> Message {
+        let number = self.frames;
+        self.frames += 1;
+        Message::Frame(Box::new(Frame {
+            report: report.clone(),
+            truth: truth.copied(),
+            imu: std::mem::take(&mut self.imu),
+            color: is_due(number, self.config.image_every).then(|| images.color.clone()),
+            depth: is_due(number, self.config.depth_every).then(|| images.depth.clone()),
+        }))
+    }
+
     /// A writer that is gone has a reason, which [`Self::close`] returns.
     fn send(&self, message: Message) {
-        let Some(sender) = &self.sender else { return };
-        match sender.try_send(message) {
-            Err(TrySendError::Full(mut message)) => {
-                if let (true, Message::Frame(frame)) = (self.lossy, &mut message) {
-                    (frame.color, frame.depth) = (None, None);
-                }
-                let _ = sender.send(message);
+        if let (Some(message), Some(sender)) = (self.try_send(message), &self.sender) {
+            let _ = sender.send(message);
+        }
+    }
+
+    /// Queues a message. If the queue is full, returns what of the message has to wait for it.
+    fn try_send(&self, message: Message) -> Option<Message> {
+        match self.sender.as_ref()?.try_send(message) {
+            Err(TrySendError::Full(Message::Frame(frame))) if self.lossy => {
+                Some(Message::Frame(Box::new(Frame { color: None, depth: None, ..*frame })))
             }
-            Ok(()) | Err(TrySendError::Disconnected(_)) => {}
+            Err(TrySendError::Full(message)) => Some(message),
+            Ok(()) | Err(TrySendError::Disconnected(_)) => None,
         }
     }
 
     fn close(&mut self) -> Result<(), ViewerError> {
         let Some(writer) = self.writer.take() else { return Ok(()) };
-        let imu = std::mem::take(&mut self.imu);
-        self.send(Message::Imu(imu));
         self.sender = None;
         writer.join().unwrap_or(Err(ViewerError::Panicked))
     }
@@ -294,7 +303,6 @@ impl Writer {
                         .map_err(ViewerError::from)
                 }
                 Message::Frame(frame) => self.log_frame(&frame),
-                Message::Imu(samples) => self.log_imu(&samples),
             };
             if let Err(error) = result {
                 self.problem.get_or_insert(error);
@@ -325,9 +333,14 @@ impl Writer {
     }
 
     fn log_imu(&mut self, samples: &[ImuSample]) -> Result<(), ViewerError> {
-        let Some(first) = samples.first() else { return Ok(()) };
-        let clock = *self.clock.get_or_insert_with(|| Clock::of(first.stamp));
-        Ok(plots::log_imu(&self.stream, clock, samples)?)
+        // Samples fall between frames.
+        self.stream.disable_timeline(FRAME);
+        for sample in samples {
+            let clock = *self.clock.get_or_insert_with(|| Clock::of(sample.stamp));
+            self.stream.set_time(TIME, clock.cell(sample.stamp));
+            plots::log_imu(&self.stream, sample)?;
+        }
+        Ok(())
     }
 
     fn finish(mut self, files: &[PathBuf]) -> Result<(), ViewerError> {
@@ -361,13 +374,14 @@ fn check_complete(path: &Path) -> Result<(), ViewerError> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::tests::frame;
     use super::*;
 
-    /// A recorder whose queue of one message nobody empties yet.
-    fn stalled(lossy: bool) -> (Recorder, Receiver<Message>) {
-        let (sender, receiver) = sync_channel(1);
-        let recorder = Recorder {
-            config: RecordingConfig::default(),
+    /// What is left to be sent of a frame that meets a full queue: the frame, and its image.
+    fn left_by_full_queue(lossy: bool) -> (bool, bool) {
+        let (sender, _receiver) = sync_channel(1);
+        let mut recorder = Recorder {
+            config: RecordingConfig { image_every: 1, ..Default::default() },
             lossy,
             sender: Some(sender),
             writer: None,
@@ -375,39 +389,22 @@ mod tests {
             imu_samples: 0,
             imu: Vec::new(),
         };
-        (recorder, receiver)
-    }
-
-    /// For each frame that arrives, whether it has its color image.
-    fn arrivals(lossy: bool) -> Vec<bool> {
-        let (mut recorder, receiver) = stalled(lossy);
-        recorder.config.image_every = 1;
-        let sending = std::thread::spawn(move || {
-            for frame in 0..3 {
-                let (report, images) = super::super::tests::frame(frame);
-                recorder.frame(&report, &images, None);
-            }
-        });
-        // The second frame meets a full queue before the first is taken.
-        std::thread::sleep(Duration::from_millis(50));
-        let first = receiver.recv();
-        std::thread::sleep(Duration::from_millis(50));
-        let frames: Vec<bool> = first
-            .into_iter()
-            .chain(&receiver)
-            .map(|message| matches!(message, Message::Frame(frame) if frame.color.is_some()))
-            .collect();
-        sending.join().unwrap();
-        frames
+        let (report, images) = frame(0);
+        recorder.frame(&report, &images, None);
+        let message = recorder.frame_message(&report, &images, None);
+        match recorder.try_send(message) {
+            Some(Message::Frame(frame)) => (true, frame.color.is_some()),
+            _ => (false, false),
+        }
     }
 
     #[test]
     fn a_full_queue_costs_a_live_view_images_but_no_frames() {
-        assert_eq!(arrivals(true), [true, false, false]);
+        assert_eq!(left_by_full_queue(true), (true, false));
     }
 
     #[test]
     fn a_full_queue_costs_a_file_nothing() {
-        assert_eq!(arrivals(false), [true, true, true]);
+        assert_eq!(left_by_full_queue(false), (true, true));
     }
 }

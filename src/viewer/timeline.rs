@@ -1,6 +1,6 @@
 //! The two timelines of a recording.
 
-use rerun::{TimeCell, TimeColumn};
+use rerun::TimeCell;
 
 use crate::inertial::Stamp;
 
@@ -30,14 +30,6 @@ impl Clock {
         match self {
             Self::Start => TimeCell::from_duration_nanos(stamp.nanos()),
             Self::Epoch => TimeCell::from_timestamp_nanos_since_epoch(stamp.nanos()),
-        }
-    }
-
-    pub(super) fn column(self, stamps: impl IntoIterator<Item = Stamp>) -> TimeColumn {
-        let nanos: Vec<i64> = stamps.into_iter().map(Stamp::nanos).collect();
-        match self {
-            Self::Start => TimeColumn::new_duration_nanos(TIME, nanos),
-            Self::Epoch => TimeColumn::new_timestamp_nanos_since_epoch(TIME, nanos),
         }
     }
 }

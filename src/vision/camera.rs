@@ -42,7 +42,8 @@ impl CameraConfig {
         let m = Matrix4::from_fn(|row, column| self.imu_from_camera[row][column]);
         let rotation: Matrix3<f64> = m.fixed_view::<3, 3>(0, 0).into_owned();
         let residual = (rotation.transpose() * rotation - Matrix3::identity()).norm();
-        if !(residual < 1e-2 && rotation.determinant() > 0.0) || !m.iter().all(|x| x.is_finite()) {
+        let finite = m.iter().all(|x| x.is_finite());
+        if !(finite && residual < 1e-2 && rotation.determinant() > 0.0) {
             return None;
         }
         let rotation = Rotation3::from_matrix(&rotation);

@@ -27,6 +27,7 @@ impl Descriptor {
     }
 
     /// Number of bits that differ, 0..=256.
+    #[inline(always)]
     pub fn hamming(&self, other: &Self) -> u32 {
         self.0.iter().zip(other.0).map(|(a, b)| (a ^ b).count_ones()).sum()
     }
@@ -87,9 +88,10 @@ pub struct FeatureConfig {
     pub levels: u8,
     /// Size ratio of consecutive pyramid levels, above 1.
     pub scale_factor: f64,
-    /// FAST threshold in grey levels: how much the circle must differ from its centre. Low, as
-    /// weak corners are taken only in cells without enough strong ones (dark, blurred, plain).
+    /// FAST threshold in grey levels: how much the circle must differ from its centre.
     pub fast_threshold: u8,
+    /// Threshold where the other one finds few corners: in dark, blurred or plain parts.
+    pub min_fast_threshold: u8,
     /// Side of the cells that share out `max_features` over the image, pixels.
     pub cell_size: f64,
     /// No two features of a frame are closer than this, pixels.
@@ -97,26 +99,19 @@ pub struct FeatureConfig {
     /// Standard deviation of a key point's position at octave 0, pixels a coordinate; grows
     /// with the square root of the scale of the octave.
     pub pixel_sigma: f64,
-    /// Standard deviation of the position of a feature that was followed from the previous frame
-    /// by optical flow, pixels a coordinate.
-    pub tracked_sigma: f64,
-    /// Optical flow that ends further than this from the corner it started at is rejected,
-    /// pixels.
-    pub max_tracking_shift: f64,
 }
 
 impl Default for FeatureConfig {
     fn default() -> Self {
         Self {
-            max_features: 1000,
+            max_features: 700,
             levels: 8,
             scale_factor: 1.2,
-            fast_threshold: 7,
+            fast_threshold: 20,
+            min_fast_threshold: 7,
             cell_size: 40.0,
             min_spacing: 4.0,
             pixel_sigma: 0.7,
-            tracked_sigma: 0.4,
-            max_tracking_shift: 3.0,
         }
     }
 }

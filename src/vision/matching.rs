@@ -67,12 +67,31 @@ pub fn match_guided(
 ) -> Vec<Match> {
     let mut best = Best::new(predictions.len(), features.len());
     let grid = PixelGrid::new(features);
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("popcnt") {
+        // SAFETY: the processor has the instruction.
+        unsafe { offer_near_with_popcnt(predictions, &grid, &mut best) };
+        return best.matches(config);
+    }
+    offer_near(predictions, &grid, &mut best);
+    best.matches(config)
+}
+
+#[inline(always)]
+fn offer_near(predictions: &[Prediction], grid: &PixelGrid, best: &mut Best) {
     for (q, prediction) in predictions.iter().enumerate() {
         grid.for_each_within(prediction.pixel, prediction.radius, |t| {
-            best.offer(q, t, prediction.descriptor.hamming(&features[t].descriptor));
+            best.offer(q, t, prediction.descriptor.hamming(&grid.features[t].descriptor));
         });
     }
-    best.matches(config)
+}
+
+/// [`offer_near`] compiled for processors that count bits in one instruction, which programs
+/// built for every x86-64 must not assume.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "popcnt")]
+fn offer_near_with_popcnt(predictions: &[Prediction], grid: &PixelGrid, best: &mut Best) {
+    offer_near(predictions, grid, best);
 }
 
 const NO_MATCH: (u32, usize) = (u32::MAX, usize::MAX);
@@ -91,6 +110,7 @@ impl Best {
     }
 
     /// Ordering by (distance, index) makes the outcome independent of the order of offers.
+    #[inline(always)]
     fn offer(&mut self, query: usize, train: usize, distance: u32) {
         let (best, second) = &mut self.forward[query];
         if (distance, train) < *best {
@@ -174,6 +194,7 @@ impl<'a> PixelGrid<'a> {
         ((offset.x as usize).min(self.columns - 1), (offset.y as usize).min(self.rows - 1))
     }
 
+    #[inline(always)]
     fn for_each_within(&self, pixel: Point2<f64>, radius: f64, mut visit: impl FnMut(usize)) {
         if !(radius >= 0.0 && is_finite(&pixel)) {
             return;

@@ -22,5 +22,5 @@ pub use frame::RgbdFrame;
 pub use image::{ColorImage, DepthImage, PixelFormat};
 pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
 #[cfg(feature = "vision")]
-pub use orb::{Link, OrbExtractor, VisionError};
+pub use orb::{OrbExtractor, VisionError};
 pub use ransac::{Correspondence, RansacConfig, estimate_pose};

@@ -1,31 +1,53 @@
 //! The front end on OpenCV: FAST corners on an image pyramid, ORB descriptors, depth.
 
 use nalgebra::{Point2, Vector2};
+use opencv::boxed_ref::BoxedRef;
 use opencv::core::{
-    KeyPoint, Mat, Point2d, Point2f, Ptr, Size, TermCriteria, TermCriteria_Type, Vec3b, Vector,
+    KeyPoint, Mat, Point2d, Ptr, Rect, Size, TermCriteria, TermCriteria_Type, Vec3b, Vector,
 };
 use opencv::features2d::{
-    FastFeatureDetector, FastFeatureDetector_DetectorType, ORB, ORB_ScoreType,
+    FastFeatureDetector, FastFeatureDetector_DetectorType, KeyPointsFilter, ORB, ORB_ScoreType,
 };
 use opencv::prelude::*;
-use opencv::{calib3d, imgproc, video};
+use opencv::{calib3d, imgproc};
 
+use super::RgbdFrame;
 use super::select::{Corner, spread};
 use super::{
     CameraConfig, DepthConfig, Descriptor, Feature, FeatureConfig, PinholeCamera, PixelFormat,
     PointMeasurement,
 };
-use crate::dataset::RgbdFrame;
 
 /// Radius of the patch that orientation and descriptor are computed from, pixels of the level.
 const PATCH_RADIUS: usize = 15;
 /// Corners closer to the border of their level than this have no patch.
 const BORDER: usize = PATCH_RADIUS + 1;
 
-/// Side of the patches that optical flow compares, pixels; smaller ones are noisier.
-const FLOW_WINDOW: i32 = 15;
-/// Patches without texture in both directions are not followed (OpenCV's default).
-const MIN_FLOW_EIGENVALUE: f64 = 1e-4;
+/// Side of the blocks of a pyramid level that corners are sought in, pixels of the level.
+const BLOCK: usize = 64;
+/// FAST compares a pixel with a circle of this radius, and its score with that of the neighbours.
+const FAST_MARGIN: usize = 4;
+/// A block with fewer corners than this is searched again with the lower threshold.
+const FEW_IN_BLOCK: usize = 8;
+/// Most corners taken from a block of one level: several times its share of the features.
+const MOST_IN_BLOCK: i32 = 16;
+
+/// A corner within a block: column, row and FAST score.
+struct BlockCorner {
+    x: usize,
+    y: usize,
+    score: f32,
+}
+
+/// Start and length of the blocks along one side of a level, such that their corners lie inside
+/// the border and on no two of them; neighbours overlap by the margin of the detector.
+fn blocks(side: usize) -> impl Iterator<Item = (usize, usize)> + Clone {
+    let inner = BORDER..side - BORDER;
+    inner.clone().step_by(BLOCK).map(move |start| {
+        let end = (start + BLOCK).min(inner.end);
+        (start - FAST_MARGIN, end - start + 2 * FAST_MARGIN)
+    })
+}
 
 /// Why a frame or a configuration gives no features.
 #[derive(Debug, thiserror::Error)]
@@ -50,18 +72,9 @@ pub struct OrbExtractor {
     pinhole: PinholeCamera,
     depth: DepthConfig,
     fast: Ptr<FastFeatureDetector>,
+    /// With the lower threshold.
+    sensitive: Ptr<FastFeatureDetector>,
     orb: Ptr<ORB>,
-    /// Grey images of the last two frames, the later one last.
-    grey: [Option<Mat>; 2],
-}
-
-/// A feature of the current frame and where its point was in the previous one.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Link {
-    /// Index of the feature.
-    pub feature: usize,
-    /// Position in the undistorted previous image, pixels.
-    pub previous: Point2<f64>,
 }
 
 impl OrbExtractor {
@@ -77,13 +90,11 @@ impl OrbExtractor {
         check("cell_size", config.cell_size, config.cell_size >= 1.0, "at least 1 pixel")?;
         check("min_spacing", config.min_spacing, config.min_spacing >= 0.0, "0 or more")?;
         check("pixel_sigma", config.pixel_sigma, config.pixel_sigma > 0.0, "above 0")?;
-        check("tracked_sigma", config.tracked_sigma, config.tracked_sigma > 0.0, "above 0")?;
         opencv::core::set_num_threads(1)?;
-        let fast = FastFeatureDetector::create(
-            i32::from(config.fast_threshold),
-            true,
-            FastFeatureDetector_DetectorType::TYPE_9_16,
-        )?;
+        let detector = |threshold: u8| {
+            let kind = FastFeatureDetector_DetectorType::TYPE_9_16;
+            FastFeatureDetector::create(i32::from(threshold), true, kind)
+        };
         // Only describes: one level at a time, at key points that are already chosen.
         let orb = ORB::create(
             1,
@@ -101,9 +112,9 @@ impl OrbExtractor {
             camera: camera.clone(),
             pinhole: PinholeCamera::from(camera),
             depth: depth.clone(),
-            fast,
+            fast: detector(config.fast_threshold)?,
+            sensitive: detector(config.min_fast_threshold.min(config.fast_threshold))?,
             orb,
-            grey: [None, None],
         })
     }
 
@@ -115,8 +126,6 @@ impl OrbExtractor {
             return Err(VisionError::SizeMismatch { color, depth });
         }
         let pyramid = self.pyramid(frame)?;
-        self.grey.rotate_left(1);
-        self.grey[1] = pyramid.first().cloned();
         let mut corners = vec![];
         for (level, image) in pyramid.iter().enumerate() {
             self.detect(level as u8, image, color, &mut corners)?;
@@ -156,25 +165,41 @@ impl OrbExtractor {
         if columns <= 2 * BORDER || rows <= 2 * BORDER {
             return Ok(());
         }
-        let mut found = Vector::<KeyPoint>::new();
-        self.fast.detect_def(image, &mut found)?;
-        for point in found {
-            let (column, row) = (point.pt().x as usize, point.pt().y as usize);
-            if (BORDER..columns - BORDER).contains(&column)
-                && (BORDER..rows - BORDER).contains(&row)
-            {
-                let scale =
-                    Vector2::new(width as f64 / columns as f64, height as f64 / rows as f64);
-                corners.push(Corner {
-                    pixel: full_pixel(Point2::new(column as f64, row as f64), scale),
-                    column,
-                    row,
-                    level,
-                    score: point.response(),
-                });
+        let scale = Vector2::new(width as f64 / columns as f64, height as f64 / rows as f64);
+        for (left, across) in blocks(columns) {
+            for (top, down) in blocks(rows) {
+                let block = Rect::new(left as i32, top as i32, across as i32, down as i32);
+                for point in self.detect_in(&image.roi(block)?)? {
+                    let (column, row) = (left + point.x, top + point.y);
+                    corners.push(Corner {
+                        pixel: full_pixel(Point2::new(column as f64, row as f64), scale),
+                        column,
+                        row,
+                        level,
+                        score: point.score,
+                    });
+                }
             }
         }
         Ok(())
+    }
+
+    /// The strongest corners of a block, with the lower threshold where the higher one finds few.
+    fn detect_in(&mut self, block: &BoxedRef<Mat>) -> Result<Vec<BlockCorner>, VisionError> {
+        let mut found = Vector::<KeyPoint>::new();
+        self.fast.detect_def(block, &mut found)?;
+        if found.len() < FEW_IN_BLOCK {
+            self.sensitive.detect_def(block, &mut found)?;
+        }
+        // Before the points cross over from OpenCV one by one.
+        KeyPointsFilter::run_by_image_border(&mut found, block.size()?, FAST_MARGIN as i32)?;
+        KeyPointsFilter::retain_best(&mut found, MOST_IN_BLOCK)?;
+        let corner = |point: KeyPoint| BlockCorner {
+            x: point.pt().x as usize,
+            y: point.pt().y as usize,
+            score: point.response(),
+        };
+        Ok(found.into_iter().map(corner).collect())
     }
 
     /// Descriptor of each corner, level by level; `corners` are ordered by level.
@@ -240,69 +265,6 @@ impl OrbExtractor {
     ) -> Option<PointMeasurement> {
         let reading = self.depth.read(&frame.depth, raw)?;
         Some(PointMeasurement::new(&self.pinhole, pixel, sigma, &reading))
-    }
-
-    /// Moves features of `frame`, the one extracted last, to where optical flow (Lucas-Kanade,
-    /// OpenCV's) finds the patch that surrounded their points in the frame before, and measures
-    /// them anew. Tells for each link whether its feature was moved; without a frame before,
-    /// none is.
-    ///
-    /// Corners jump between frames by about half a pixel; patches do not (7-Scenes: 0.52 px
-    /// against 0.17 px a coordinate). The price is a slow drift along the track.
-    pub fn follow(
-        &self,
-        frame: &RgbdFrame,
-        features: &mut [Feature],
-        links: &[Link],
-    ) -> Result<Vec<bool>, VisionError> {
-        let mut moved = vec![false; links.len()];
-        let [Some(before), Some(now)] = &self.grey else { return Ok(moved) };
-        if links.is_empty() || before.size()? != now.size()? {
-            return Ok(moved);
-        }
-        let raw = |pixel: Point2<f64>| {
-            let raw = self.camera.distort(pixel);
-            Point2f::new(raw.x as f32, raw.y as f32)
-        };
-        let from: Vector<Point2f> = links.iter().map(|link| raw(link.previous)).collect();
-        let start: Vector<Point2f> = links
-            .iter()
-            .map(|link| features.get(link.feature).map_or_else(Point2f::default, |f| raw(f.pixel)))
-            .collect();
-        let (mut to, mut found, mut error) =
-            (start.clone(), Vector::<u8>::new(), Vector::<f32>::new());
-        video::calc_optical_flow_pyr_lk(
-            before,
-            now,
-            &from,
-            &mut to,
-            &mut found,
-            &mut error,
-            Size::new(FLOW_WINDOW, FLOW_WINDOW),
-            0,
-            criteria(20, 0.01)?,
-            video::OPTFLOW_USE_INITIAL_FLOW,
-            MIN_FLOW_EIGENVALUE,
-        )?;
-        let ends: Vec<_> = to.iter().map(|p| Point2::new(f64::from(p.x), f64::from(p.y))).collect();
-        let pixels = self.undistort(ends.iter().copied())?;
-        let flows = start.iter().zip(found).zip(ends.iter().zip(pixels));
-        for ((moved, link), ((start, found), (end, pixel))) in
-            moved.iter_mut().zip(links).zip(flows)
-        {
-            let start = Point2::new(f64::from(start.x), f64::from(start.y));
-            let near = (end - start).norm() <= self.config.max_tracking_shift;
-            if let Some(feature) = features.get_mut(link.feature)
-                && found == 1
-                && near
-            {
-                feature.pixel = pixel;
-                feature.measurement =
-                    self.measurement(frame, *end, pixel, self.config.tracked_sigma);
-                *moved = true;
-            }
-        }
-        Ok(moved)
     }
 
     /// Pixels of the same camera without distortion.
@@ -464,50 +426,6 @@ mod tests {
     }
 
     /// The second image is the first, moved by a known fraction of a pixel.
-    #[test]
-    fn followed_features_move_by_fractions_of_a_pixel() {
-        const SHIFT: f64 = 0.4;
-        let first = collage(4);
-        let second = (0..WIDTH * HEIGHT).map(|i| {
-            let left = if i % WIDTH == 0 { i } else { i - 1 };
-            (f64::from(first[i]) * (1.0 - SHIFT) + f64::from(first[left]) * SHIFT).round() as u8
-        });
-        let (first, second) =
-            (frame(WIDTH, HEIGHT, first.clone()), frame(WIDTH, HEIGHT, second.collect()));
-        let mut extractor = extractor();
-        let before = extractor.extract(&first).unwrap();
-        assert_eq!(extractor.follow(&first, &mut [], &[]).unwrap(), []);
-        let mut now = extractor.extract(&second).unwrap();
-        let link = |(feature, f): (usize, &Feature)| {
-            let near = |b: &&Feature| (b.pixel - f.pixel).norm() < 2.0;
-            Some(Link { feature, previous: before.iter().find(near)?.pixel })
-        };
-        let links: Vec<_> = now.iter().enumerate().filter_map(link).collect();
-        let moved = extractor.follow(&second, &mut now, &links).unwrap();
-        let errors = links.iter().zip(&moved).filter(|(_, moved)| **moved).map(|(link, _)| {
-            (now[link.feature].pixel - link.previous - Vector2::new(SHIFT, 0.0)).norm()
-        });
-        let errors: Vec<_> = errors.collect();
-        assert!(errors.len() > 200, "{} of {}", errors.len(), links.len());
-        let good = errors.iter().filter(|e| **e < 0.1).count();
-        assert!(good * 10 > errors.len() * 9, "{good} of {}", errors.len());
-    }
-
-    #[test]
-    fn links_to_nowhere_move_nothing() {
-        let mut extractor = extractor();
-        let frame = frame(WIDTH, HEIGHT, collage(4));
-        let mut features = extractor.extract(&frame).unwrap();
-        let link = Link { feature: 0, previous: Point2::origin() };
-        assert_eq!(extractor.follow(&frame, &mut features, &[link]).unwrap(), [false]);
-        extractor.extract(&frame).unwrap();
-        let lost = [
-            Link { feature: usize::MAX, previous: Point2::new(50.0, 50.0) },
-            Link { feature: 0, previous: Point2::new(-1e9, f64::NAN) },
-        ];
-        assert_eq!(extractor.follow(&frame, &mut features, &lost).unwrap(), [false, false]);
-    }
-
     #[test]
     fn images_of_different_sizes_are_refused() {
         let mut broken = frame(WIDTH, HEIGHT, collage(1));
