@@ -5,12 +5,11 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use mfg_vio::dataset::RgbdFrame;
 use mfg_vio::inertial::Stamp;
 use mfg_vio::vision::{
     CameraConfig, ColorImage, Correspondence, DepthConfig, DepthImage, Descriptor, Feature,
     FeatureConfig, Match, MatchingConfig, OrbExtractor, PinholeCamera, PixelFormat, Prediction,
-    RansacConfig, estimate_pose, match_descriptors, match_guided,
+    RansacConfig, RgbdFrame, estimate_pose, match_descriptors, match_guided,
 };
 use nalgebra::{
     Isometry3, Matrix3, Matrix6, Point3, Quaternion, Rotation3, Translation3, UnitQuaternion,

@@ -1,15 +1,15 @@
-use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
+use std::path::PathBuf;
 
 use anyhow::Context;
 
 use super::replay::{Plan, Settings, Target, print_summary};
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::simulate::render;
+use super::terminal::catch_interrupts;
 use mfg_vio::config::Config;
-use mfg_vio::dataset::{self, Event, LogWriter};
-use mfg_vio::evaluation::write_html;
+use mfg_vio::dataset;
+use mfg_vio::evaluation::report::write_html;
 use mfg_vio::replay::report;
-use mfg_vio::simulation::{SceneConfig, Simulation};
+use mfg_vio::simulation::SceneConfig;
 
 /// Simulate a short log, replay it, evaluate it and draw it: the main job with no data at hand.
 #[derive(Debug, clap::Args)]
@@ -28,7 +28,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     catch_interrupts()?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("{}", args.out.display()))?;
     let log = args.out.join("demo.mcap");
-    simulate(&log)?;
+    render(SceneConfig { duration: DEMO_SECONDS, ..SceneConfig::default() }, &log)?;
 
     let config_name = "sim".to_owned();
     let config = Config::shipped(&config_name, args.settings.overrides())?;
@@ -51,26 +51,5 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         figure.save(&args.out.join(name).with_extension("png"))?;
     }
     print_summary(&replayed.metrics, Some(&args.out));
-    Ok(())
-}
-
-fn simulate(log: &Path) -> anyhow::Result<()> {
-    let scene = SceneConfig { duration: DEMO_SECONDS, ..SceneConfig::default() };
-    let mut simulation = Simulation::new(scene)?;
-    let mut writer = LogWriter::create(log, simulation.config().log.clone())?;
-    simulation.write_calibration(&mut writer)?;
-    let frames = DEMO_SECONDS * simulation.config().image.rate;
-    let bar = progress(Some(frames as u64 + 1), "simulated");
-    for event in &mut simulation {
-        writer.event(&event)?;
-        if matches!(event, Event::Frame(_)) {
-            bar.inc(1);
-        }
-        if INTERRUPTED.load(Ordering::Relaxed) {
-            break;
-        }
-    }
-    bar.finish_and_clear();
-    writer.finish()?;
     Ok(())
 }

@@ -364,7 +364,7 @@ fn ape(args: &ApeArgs) -> anyhow::Result<()> {
             align_n: inputs.matching.align_n.map(NonZeroUsize::get),
             relation: inputs.relation.into(),
         };
-        let file = path.display().to_string();
+        let (file, name) = (path.display().to_string(), name_of(path));
         let (reference, estimate) = (&reference.trajectory, &estimate.trajectory);
         let pairs = evaluation::associate(reference, estimate, &options.association)
             .with_context(|| file.clone())?;
@@ -375,12 +375,12 @@ fn ape(args: &ApeArgs) -> anyhow::Result<()> {
         if args.output.draws() {
             let unit = options.relation.unit();
             figures.push(
-                evaluation::trajectory_figure(&result.pairs, &result.errors, unit).titled(&file),
+                evaluation::trajectory_figure(&result.pairs, &result.errors, unit).titled(&name),
             );
             let stamps = &result.pairs.stamps;
             figures
-                .push(evaluation::error_figure(stamps, &result.errors, unit, None).titled(&file));
-            groups.push((name_of(path), result.errors));
+                .push(evaluation::error_figure(stamps, &result.errors, unit, None).titled(&name));
+            groups.push((name, result.errors));
         }
         reports.push(EstimateReport {
             file,
@@ -433,7 +433,7 @@ fn rpe(args: &RpeArgs) -> anyhow::Result<()> {
             delta,
             all_pairs: args.all_pairs,
         };
-        let file = path.display().to_string();
+        let (file, name) = (path.display().to_string(), name_of(path));
         let (reference, estimate) = (&reference.trajectory, &estimate.trajectory);
         let result =
             evaluation::rpe(reference, estimate, &options).with_context(|| file.clone())?;
@@ -447,7 +447,7 @@ fn rpe(args: &RpeArgs) -> anyhow::Result<()> {
         }
         if args.output.draws() {
             if !lengths.is_empty() {
-                figures.push(evaluation::relative_error_figure(&lengths).titled(&file));
+                figures.push(evaluation::relative_error_figure(&lengths).titled(&name));
             }
             let ends: Vec<f64> = result
                 .links
@@ -455,8 +455,8 @@ fn rpe(args: &RpeArgs) -> anyhow::Result<()> {
                 .filter_map(|&(_, j)| result.pairs.stamps.get(j).copied())
                 .collect();
             let unit = options.relation.unit();
-            figures.push(evaluation::error_figure(&ends, &result.errors, unit, None).titled(&file));
-            groups.push((name_of(path), result.errors));
+            figures.push(evaluation::error_figure(&ends, &result.errors, unit, None).titled(&name));
+            groups.push((name, result.errors));
         }
         reports.push(EstimateReport {
             file,

@@ -8,6 +8,8 @@ use super::terminal::{INTERRUPTED, catch_interrupts, progress};
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, LogSummary};
 use mfg_vio::filter::FilterKind;
+#[cfg(feature = "viewer")]
+use mfg_vio::inertial::ImuSample;
 use mfg_vio::odometry::{InitMode, StepReport};
 use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
 use mfg_vio::viewer::Contents;
@@ -182,11 +184,12 @@ impl Plan<'_> {
         let mut front_end =
             OrbExtractor::new(&self.config.features, &self.config.camera, &self.config.depth)?;
         let contents = Contents {
-            name: self
-                .log
-                .file_stem()
-                .map(|s| s.to_string_lossy().into_owned())
-                .unwrap_or_default(),
+            name: format!(
+                "{}, {}, seed {}",
+                self.log.display(),
+                self.settings.filter,
+                self.settings.seed
+            ),
             truth: self.truth.is_some() || self.summary.has_truth,
             imu: self.summary.has_imu,
         };
@@ -265,6 +268,12 @@ impl Observer for Recording {
             recorder.camera(&camera, &imu_from_camera, size);
         }
         recorder.frame(report, frame, truth);
+    }
+
+    fn imu(&mut self, sample: &ImuSample) {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.imu(sample);
+        }
     }
 
     fn map_every(&self) -> u64 {

@@ -1,11 +1,12 @@
-use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
 
-use anyhow::Context;
 use clap::Args;
-use indicatif::{ProgressBar, ProgressStyle};
-use mfg_vio::dataset::{Event, LogWriter};
+
+use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use mfg_vio::dataset::{LogWriter, WriteSummary};
+use mfg_vio::odometry::Event;
 use mfg_vio::simulation::{SceneConfig, Simulation};
 
 /// Render an RGB-D + IMU log with ground truth.
@@ -71,28 +72,8 @@ pub fn run(args: SimulateArgs) -> anyhow::Result<()> {
     }
     scene.duration = args.duration.unwrap_or(scene.duration);
     scene.seed = args.seed.unwrap_or(scene.seed);
-    let mut simulation = Simulation::new(scene)?;
-    let mut log = LogWriter::create(&args.out, simulation.config().log.clone())?;
-    simulation.write_calibration(&mut log)?;
-
-    let interrupted = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&interrupted);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed))
-        .context("cannot catch interrupts")?;
-    let frames = simulation.config().duration * simulation.config().image.rate;
-    let progress = ProgressBar::new(frames as u64 + 1);
-    progress.set_style(ProgressStyle::with_template("{bar:40} {pos}/{len} frames, {eta} left")?);
-    for event in &mut simulation {
-        log.event(&event)?;
-        if matches!(event, Event::Frame(_)) {
-            progress.inc(1);
-        }
-        if interrupted.load(Ordering::Relaxed) {
-            break;
-        }
-    }
-    let summary = log.finish()?;
-    progress.finish_and_clear();
+    catch_interrupts()?;
+    let summary = render(scene, &args.out)?;
     println!(
         "{}: {} frames, {} IMU samples, {} truth poses",
         args.out.display(),
@@ -100,8 +81,29 @@ pub fn run(args: SimulateArgs) -> anyhow::Result<()> {
         summary.imu_samples,
         summary.truth_poses
     );
-    if interrupted.load(Ordering::Relaxed) {
-        anyhow::bail!("interrupted; {} is complete up to there", args.out.display());
-    }
     Ok(())
+}
+
+/// Writes the log of a scene; an interrupted one is complete up to there.
+pub fn render(scene: SceneConfig, out: &Path) -> anyhow::Result<WriteSummary> {
+    let simulation = Simulation::new(scene)?;
+    let log = LogWriter::create(out, simulation.config().log.clone())?;
+    let frames = simulation.config().duration * simulation.config().image.rate;
+    let bar = progress(Some(frames as u64 + 1), "simulated frames");
+    let summary = simulation.write(log, |event| {
+        if matches!(event, Event::Frame(_)) {
+            bar.inc(1);
+        }
+        match INTERRUPTED.load(Ordering::Relaxed) {
+            true => ControlFlow::Break(()),
+            false => ControlFlow::Continue(()),
+        }
+    })?;
+    bar.finish_and_clear();
+    anyhow::ensure!(
+        !INTERRUPTED.load(Ordering::Relaxed),
+        "interrupted; {} is complete up to there",
+        out.display()
+    );
+    Ok(summary)
 }

@@ -3,8 +3,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-pub use crate::odometry::{Event, TruthPose};
-pub use crate::vision::RgbdFrame;
+use crate::odometry::Event;
 
 /// What a reader met: counts that end up in `metrics.json`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]

@@ -21,6 +21,9 @@ mod seven_scenes;
 mod tum;
 mod write;
 
-pub use event::{Event, Log, LogConfig, LogError, LogSummary, ReadReport, RgbdFrame, TruthPose};
+use crate::odometry::{Event, TruthPose};
+use crate::vision::RgbdFrame;
+
+pub use event::{Log, LogConfig, LogError, LogSummary, ReadReport};
 pub use open::{detect, open};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

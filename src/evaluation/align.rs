@@ -277,7 +277,8 @@ mod tests {
             pose.translation.x *= -1.0;
         }
         let found = align(&pairs, Alignment::Se3, None).unwrap();
-        assert_relative_eq!(found.rotation.to_rotation_matrix().matrix().determinant(), 1.0);
+        let determinant = found.rotation.to_rotation_matrix().matrix().determinant();
+        assert_relative_eq!(determinant, 1.0, epsilon = 1e-12);
     }
 
     #[test]

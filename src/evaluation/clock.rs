@@ -1,5 +1,3 @@
-use nalgebra::{Isometry3, UnitQuaternion};
-
 use super::{EvaluationError, Trajectory};
 
 /// How far the clock of an estimate is from that of the reference.
@@ -13,11 +11,15 @@ pub struct ClockOffset {
     pub correlation_at_start: f64,
 }
 
-/// Angular speeds are taken over this time: long enough to quieten the noise of a motion capture
-/// system, short enough to keep what people and robots do, s.
-const WINDOW: f64 = 0.1;
-/// Attitudes are not interpolated across longer intervals, s.
-const MAX_GAP: f64 = 0.25;
+/// Angular speeds are taken over at least this time: long enough to quieten the noise of a motion
+/// capture system, short enough to keep what people and robots do, s.
+const MIN_WINDOW: f64 = 0.1;
+/// ... and over at least so many pose intervals: over one, the speeds of slow trajectories (10 Hz)
+/// are aliased, which moved the maximum by 15 ms on VCU-RVI's lab_motion1.
+const WINDOW_INTERVALS: f64 = 2.0;
+/// Attitudes are not interpolated across intervals longer than this (s) and this many windows.
+const MIN_GAP: f64 = 0.25;
+const GAP_WINDOWS: f64 = 1.25;
 /// Samples of the estimate that are compared.
 const SAMPLES: usize = 4000;
 /// An offset is considered where at least this fraction of the samples meets the reference.
@@ -67,6 +69,8 @@ pub(super) fn nearby_clock_offset(
 struct Signal {
     stamps: Vec<f64>,
     speeds: Vec<f64>,
+    /// Longest interval between two stamps that is no gap, s.
+    max_interval: f64,
 }
 
 struct Signals {
@@ -76,8 +80,14 @@ struct Signals {
 
 impl Signals {
     fn of(reference: &Trajectory, estimate: &Trajectory) -> Self {
+        let interval = |trajectory: &Trajectory| trajectory.median_interval().unwrap_or(0.0);
+        let slower = interval(reference).max(interval(estimate));
+        let window = MIN_WINDOW.max(WINDOW_INTERVALS * slower);
         let stride = estimate.len().div_ceil(SAMPLES);
-        Self { reference: Signal::of(reference, 1), estimate: Signal::of(estimate, stride) }
+        Self {
+            reference: Signal::of(reference, window, 1),
+            estimate: Signal::of(estimate, window, stride),
+        }
     }
 
     /// The offset between `from` and `to` (s) where the correlation is largest.
@@ -130,56 +140,57 @@ fn vertex(before: f64, middle: f64, after: f64) -> f64 {
 }
 
 impl Signal {
-    /// The angular speed at every `stride`-th pose of which both ends of the window are known.
-    fn of(trajectory: &Trajectory, stride: usize) -> Self {
+    /// The angular speed over `window` (s) at every `stride`-th pose of which both ends of the
+    /// window are known.
+    fn of(trajectory: &Trajectory, window: f64, stride: usize) -> Self {
+        let max_interval = MIN_GAP.max(GAP_WINDOWS * window);
         let (mut early, mut late) = (0, 0);
+        let attitude = |stamp: f64, cursor: &mut usize| {
+            let (i, fraction) = bracket(trajectory.stamps(), stamp, max_interval, cursor)?;
+            let (a, b) = (trajectory.poses().get(i)?, trajectory.poses().get(i + 1)?);
+            Some(a.rotation.rotation_to(&b.rotation).powf(fraction) * a.rotation)
+        };
         let (stamps, speeds) = trajectory
             .stamps()
             .iter()
             .step_by(stride)
             .filter_map(|&stamp| {
-                let start = attitude_at(trajectory, stamp - WINDOW / 2.0, &mut early)?;
-                let end = attitude_at(trajectory, stamp + WINDOW / 2.0, &mut late)?;
-                Some((stamp, start.angle_to(&end) / WINDOW))
+                let start = attitude(stamp - window / 2.0, &mut early)?;
+                let end = attitude(stamp + window / 2.0, &mut late)?;
+                Some((stamp, start.angle_to(&end) / window))
             })
             .unzip();
-        Self { stamps, speeds }
+        Self { stamps, speeds, max_interval }
     }
 
-    /// Linear between samples; `cursor` moves forward only as long as `stamp` does.
+    /// Linear between samples; stamps asked for with one `cursor` must ascend.
     fn at(&self, stamp: f64, cursor: &mut usize) -> Option<f64> {
-        let (i, fraction) = bracket(&self.stamps, stamp, cursor)?;
+        let (i, fraction) = bracket(&self.stamps, stamp, self.max_interval, cursor)?;
         Some(self.speeds[i] + (self.speeds[i + 1] - self.speeds[i]) * fraction)
     }
 }
 
-fn attitude_at(
-    trajectory: &Trajectory,
-    stamp: f64,
-    cursor: &mut usize,
-) -> Option<UnitQuaternion<f64>> {
-    let (i, fraction) = bracket(trajectory.stamps(), stamp, cursor)?;
-    let [a, b]: &[Isometry3<f64>; 2] = trajectory.poses().get(i..i + 2)?.try_into().ok()?;
-    let step = a.rotation.rotation_to(&b.rotation);
-    Some(step.powf(fraction) * a.rotation)
-}
-
 /// Index `i` and fraction such that `stamp` is that far from `stamps[i]` to `stamps[i + 1]`;
-/// `None` outside and in gaps.
-fn bracket(stamps: &[f64], stamp: f64, cursor: &mut usize) -> Option<(usize, f64)> {
+/// `None` outside and in intervals longer than `max_interval`.
+fn bracket(
+    stamps: &[f64],
+    stamp: f64,
+    max_interval: f64,
+    cursor: &mut usize,
+) -> Option<(usize, f64)> {
     while stamps.get(*cursor + 1).is_some_and(|next| *next < stamp) {
         *cursor += 1;
     }
     let (from, to) = (stamps.get(*cursor)?, stamps.get(*cursor + 1)?);
     let interval = to - from;
-    let inside = *from <= stamp && stamp <= *to && interval > 0.0 && interval <= MAX_GAP;
+    let inside = *from <= stamp && stamp <= *to && interval > 0.0 && interval <= max_interval;
     inside.then(|| (*cursor, (stamp - from) / interval))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::vector;
+    use nalgebra::{Isometry3, vector};
     use proptest::prelude::*;
 
     fn trajectory(rate: f64, duration: f64, clock: f64, start: f64) -> Trajectory {

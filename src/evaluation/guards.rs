@@ -76,7 +76,7 @@ impl fmt::Display for Suspicion {
             ),
             Self::Scale { scale } => write!(
                 f,
-                "the estimate fits best when scaled by {scale:.3}: wrong units of depth or calibration? (--align sim3)"
+                "the estimate fits best when scaled by {scale:.3}: drift, or a wrong unit or calibration (compare --align sim3)"
             ),
             Self::ClockOffset { seconds } => write!(
                 f,
@@ -281,10 +281,10 @@ pub(super) fn too_few_matches(
 fn time_unit_hint(reference: &Trajectory, estimate: &Trajectory) -> Option<String> {
     let thousands = |a: f64, b: f64| ((a / b).log10() / 3.0).round() as i32;
     let duration = |t: &Trajectory| t.range()[1] - t.range()[0];
-    let by_interval = thousands(median_interval(estimate)?, median_interval(reference)?);
+    let by_interval = thousands(estimate.median_interval()?, reference.median_interval()?);
     let by_duration = thousands(duration(estimate), duration(reference));
     let (who, power) = match (by_interval, by_duration) {
-        (0, 0) => ("both trajectories", thousands(median_interval(reference)?, TYPICAL_INTERVAL)),
+        (0, 0) => ("both trajectories", thousands(reference.median_interval()?, TYPICAL_INTERVAL)),
         (a, b) if a == b && a > 0 => ("the estimate", a),
         (a, b) if a == b => ("the reference", -a),
         _ => return None,
@@ -300,14 +300,6 @@ fn time_unit_hint(reference: &Trajectory, estimate: &Trajectory) -> Option<Strin
 
 /// Geometric middle of usual pose intervals (1 ms to 1 s), s.
 const TYPICAL_INTERVAL: f64 = 0.03;
-
-/// `None` for a single pose or where most stamps are equal.
-fn median_interval(trajectory: &Trajectory) -> Option<f64> {
-    let mut intervals: Vec<f64> = trajectory.stamps().windows(2).map(|w| w[1] - w[0]).collect();
-    intervals.sort_unstable_by(f64::total_cmp);
-    let median = quantile(&intervals, 0.5);
-    (median > 0.0).then_some(median)
-}
 
 #[cfg(test)]
 mod tests {

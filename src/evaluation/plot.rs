@@ -220,8 +220,10 @@ struct Canvas {
 
 type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
-/// Margins around the axes: top, right, bottom (labels), left (labels).
-const MARGINS: [u32; 4] = [34, 20, 46, 68];
+/// Room around the axes: top, right, bottom (labels), left (labels).
+const MARGINS: [u32; 4] = [34, 20, 44, 64];
+/// Room left of a panel, so that its labels stay clear of its neighbour.
+const SPACE: u32 = 14;
 const COLOR_BAR: u32 = 84;
 
 impl Canvas {
@@ -249,12 +251,14 @@ impl Canvas {
         let [top, right, bottom, left] = MARGINS.map(|margin| self.px(margin));
         let (width, _) = area.dim_in_pixel();
         let style = self.text(14).pos(Pos::new(HPos::Center, VPos::Center));
-        let position = ((left + width.saturating_sub(right)) as i32 / 2, self.px(18) as i32);
+        let centre = (self.px(SPACE) + left + width.saturating_sub(right)) / 2;
+        let position = (centre as i32, self.px(18) as i32);
         area.draw(&Text::new(title.to_owned(), position, style)).map_err(drawing)?;
         let [x, y] = ranges;
         let mut chart = ChartBuilder::on(area)
             .margin_top(top)
             .margin_right(right)
+            .margin_left(self.px(SPACE))
             .x_label_area_size(bottom)
             .y_label_area_size(left)
             .build_cartesian_2d(x[0]..x[1], y[0]..y[1])
@@ -307,7 +311,7 @@ impl Canvas {
         let (left, right) = area.split_horizontally(width.saturating_sub(self.px(COLOR_BAR)));
         let [top, margin_right, bottom, margin_left] = MARGINS.map(|margin| self.px(margin));
         let inner = [
-            width.saturating_sub(self.px(COLOR_BAR) + margin_left + margin_right).max(1),
+            width.saturating_sub(self.px(COLOR_BAR + SPACE) + margin_left + margin_right).max(1),
             height.saturating_sub(top + bottom).max(1),
         ];
         let points = || panel.reference.iter().chain(&panel.estimate);
@@ -425,15 +429,16 @@ impl Canvas {
             .collect();
         let highest = extent(quantiles.iter().flatten().copied().chain([0.0]));
         let count = panel.groups.len().max(1) as f64;
-        let names = |x: &f64| {
-            let index = (x - 0.5).round();
-            let on_group = (x - 0.5 - index).abs() < 1e-6 && index >= 0.0;
-            let group = on_group.then(|| panel.groups.get(index as usize)).flatten();
-            group.map_or_else(String::new, |(name, _)| name.clone())
-        };
         let ranges = [[0.0, count], padded(highest)];
         let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
-        let mut chart = self.chart(area, &panel.title, labels, ranges, Some(&names))?;
+        let mut chart = self.chart(area, &panel.title, labels, ranges, Some(&|_| String::new()))?;
+        let style = self.text(12).pos(Pos::new(HPos::Center, VPos::Top));
+        let names = panel.groups.iter().enumerate().map(|(index, (name, _))| {
+            let below = (0, self.px(8) as i32);
+            EmptyElement::at((index as f64 + 0.5, ranges[1][0]))
+                + Text::new(name.clone(), below, style.clone())
+        });
+        chart.draw_series(names).map_err(drawing)?;
         let color = COLORS[0];
         for (index, [low, first, median, third, high]) in quantiles.into_iter().enumerate() {
             if !median.is_finite() {

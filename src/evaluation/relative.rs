@@ -257,11 +257,11 @@ mod tests {
 
     #[test]
     fn seconds_survive_rounding_and_gaps() {
-        let stamps: Vec<f64> = (0..40).map(|i| 1.4e9 + f64::from(i) * 0.1).collect();
+        let stamps: Vec<f64> = (0..41).map(|i| 1.4e9 + f64::from(i) * 0.1).collect();
         let pairs = line(&stamps);
         let consecutive = links(&pairs, Delta::Seconds(1.0), false).unwrap();
-        assert_eq!(consecutive, [(0, 10), (10, 20), (20, 30)]);
-        assert_eq!(links(&pairs, Delta::Seconds(1.0), true).unwrap().len(), 30);
+        assert_eq!(consecutive, [(0, 10), (10, 20), (20, 30), (30, 40)]);
+        assert_eq!(links(&pairs, Delta::Seconds(1.0), true).unwrap().len(), 32);
         let gap = line(&[0.0, 0.5, 1.0, 1.5, 7.0, 7.5, 8.0]);
         assert_eq!(links(&gap, Delta::Seconds(1.0), false).unwrap(), [(0, 2), (4, 6)]);
     }

@@ -59,6 +59,18 @@ impl Trajectory {
     pub fn range(&self) -> [f64; 2] {
         [self.stamps[0], self.stamps[self.stamps.len() - 1]]
     }
+
+    /// Median time between neighbours (s); `None` for a single pose or where most stamps are
+    /// equal.
+    pub fn median_interval(&self) -> Option<f64> {
+        let mut intervals: Vec<f64> = self.stamps.windows(2).map(|w| w[1] - w[0]).collect();
+        let middle = intervals.len() / 2;
+        if intervals.is_empty() {
+            return None;
+        }
+        let (_, median, _) = intervals.select_nth_unstable_by(middle, f64::total_cmp);
+        Some(*median).filter(|median| *median > 0.0)
+    }
 }
 
 #[cfg(test)]

@@ -233,7 +233,7 @@ mod tests {
         let text = "#timestamp, p_RS_R_x [m], ...\n1403715524907143168,0.5,1.9,0.9,0,0,0,1,7,8,9\n";
         let file = parse_trajectory(text).unwrap();
         assert_eq!(file.format, TrajectoryFormat::Euroc);
-        assert_eq!(file.trajectory.stamps(), [1403715524.907143168]);
+        assert_eq!(file.trajectory.stamps(), [1_403_715_524.907_143]);
         assert_eq!(file.trajectory.poses()[0].rotation.quaternion().k, 1.0);
         // Time since the start of the device, and a comma at the end of the line.
         let text =

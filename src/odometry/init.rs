@@ -113,15 +113,15 @@ pub struct Initializer {
 impl Initializer {
     pub fn attempt(&self, evidence: &Evidence) -> Attempt {
         match self.init.mode {
-            InitMode::Truth => self.from_truth(evidence),
+            InitMode::Truth => self.with_truth(evidence),
             InitMode::Static | InitMode::Auto => match evidence.imu {
-                Some(imu) => self.from_imu(evidence, imu),
+                Some(imu) => self.with_imu(evidence, imu),
                 None => self.without_imu(),
             },
         }
     }
 
-    fn from_truth(&self, evidence: &Evidence) -> Attempt {
+    fn with_truth(&self, evidence: &Evidence) -> Attempt {
         let first = evidence.first_frame;
         let enough = first.offset_by(0.5 * VELOCITY_SPAN);
         let reached = evidence.truth.newest().is_some_and(|newest| newest >= enough);
@@ -180,7 +180,7 @@ impl Initializer {
         }
     }
 
-    fn from_imu(&self, evidence: &Evidence, imu: &[ImuSample]) -> Attempt {
+    fn with_imu(&self, evidence: &Evidence, imu: &[ImuSample]) -> Attempt {
         let first = evidence.first_frame;
         let until = |seconds: f64| first.offset_by(seconds);
         let covered = |seconds: f64| imu.last().is_some_and(|s| s.stamp >= until(seconds));

@@ -20,7 +20,7 @@ pub use pipeline::{FrontEndFrame, Odometry, OdometryStats};
 pub use report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
-pub use runner::{FrontEnd, RunOptions, run};
+pub use runner::{FrontEnd, Observation, RunOptions, run};
 pub use truth::{TruthConfig, TruthTrack, Up, z_up_from_reference};
 
 /// Where in the image a map point is looked for.

@@ -6,7 +6,7 @@ use std::thread;
 use std::time::Instant;
 
 use super::{Event, FrontEndFrame, Odometry, StepReport};
-use crate::inertial::Stamp;
+use crate::inertial::{ImuSample, Stamp};
 use crate::vision::{Feature, RgbdFrame};
 
 /// Finds the features of one frame; holds no state that one frame hands to the next.
@@ -44,24 +44,35 @@ enum Prepared {
     Frame(FrontEndFrame),
 }
 
-/// Runs all of `events` through `odometry`, which is given back each report with its frame.
+/// What a run shows while it goes on.
+pub enum Observation<'a> {
+    /// A sample, as it is read.
+    Imu(&'a ImuSample),
+    /// A frame that was processed, and the pipeline after it.
+    Frame { report: &'a StepReport, frame: &'a RgbdFrame, odometry: &'a Odometry },
+}
+
+/// Runs all of `events` through `odometry` and shows `observe` what happens, in order of time.
 pub fn run(
     events: impl Iterator<Item = Event> + Send,
     front_end: &mut dyn FrontEnd,
     odometry: &mut Odometry,
     options: RunOptions,
-    mut observe: impl FnMut(StepReport, &RgbdFrame, &Odometry),
+    mut observe: impl FnMut(Observation),
 ) {
     let events = Clipped { events, options, first: None };
     let mut feed = |prepared: Prepared| {
         match prepared {
-            Prepared::Other(Event::Imu(sample)) => odometry.push_imu(sample),
+            Prepared::Other(Event::Imu(sample)) => {
+                observe(Observation::Imu(&sample));
+                odometry.push_imu(sample);
+            }
             Prepared::Other(Event::Truth(pose)) => odometry.push_truth(pose),
             Prepared::Other(Event::Frame(_)) => {}
             Prepared::Frame(frame) => odometry.push_frame(frame),
         }
         while let Some((report, frame)) = odometry.step() {
-            observe(report, &frame, odometry);
+            observe(Observation::Frame { report: &report, frame: &frame, odometry });
         }
     };
     if options.threads <= 1 {
@@ -77,7 +88,7 @@ pub fn run(
     }
     odometry.end();
     while let Some((report, frame)) = odometry.step() {
-        observe(report, &frame, odometry);
+        observe(Observation::Frame { report: &report, frame: &frame, odometry });
     }
 }
 

@@ -22,8 +22,10 @@ use crate::evaluation::{
     read_trajectory,
 };
 use crate::filter::FilterKind;
-use crate::inertial::Stamp;
-use crate::odometry::{Event, FrontEnd, Odometry, RunOptions, StepReport, TruthPose, run};
+use crate::inertial::{ImuSample, Stamp};
+use crate::odometry::{
+    Event, FrontEnd, Observation, Odometry, RunOptions, StepReport, TruthPose, run,
+};
 use crate::vision::RgbdFrame;
 use metrics::{StageLog, peak_memory_bytes};
 use outputs::Outputs;
@@ -72,6 +74,9 @@ pub trait Observer {
     /// `truth` is the reference pose at the frame, moved so that it starts where the estimate
     /// starts.
     fn frame(&mut self, report: &StepReport, frame: &RgbdFrame, truth: Option<&Isometry3<f64>>);
+
+    /// A sample as it is read, biases and noise included.
+    fn imu(&mut self, _sample: &ImuSample) {}
 
     /// Every how many frames a report should carry the map; 0: never.
     fn map_every(&self) -> u64 {
@@ -126,9 +131,12 @@ pub fn replay(
     let given = given.map(Iterator::peekable);
     let events = EventSource { log: log.as_mut(), given, pending: None, truth: &mut truth };
     let mut span = Span::default();
-    run(events, front_end, &mut odometry, options, |report, frame, odometry| {
-        span.extend(report.stamp);
-        session.step(&report, frame, odometry, observers);
+    run(events, front_end, &mut odometry, options, |observation| match observation {
+        Observation::Imu(sample) => observers.iter_mut().for_each(|o| o.imu(sample)),
+        Observation::Frame { report, frame, odometry } => {
+            span.extend(report.stamp);
+            session.step(report, frame, odometry, observers);
+        }
     });
     let wall_seconds = clock.elapsed().as_secs_f64();
     let cpu_seconds = cpu_clock.elapsed().as_secs_f64();

@@ -78,6 +78,12 @@ pub struct ImuSensorConfig {
     pub gyro_bias_sd: f64,
     /// Standard deviation of each accelerometer bias at the start, m/s^2.
     pub accel_bias_sd: f64,
+    /// Scale error of the gyroscope: `measured = (1 + error) true + ...`.
+    pub gyro_scale_error: f64,
+    /// Scale error of the accelerometer.
+    pub accel_scale_error: f64,
+    /// Spans without samples: start and length, s.
+    pub gaps: Vec<[f64; 2]>,
     /// Magnitude of gravity, m/s^2.
     pub gravity: f64,
 }
@@ -94,6 +100,9 @@ impl Default for ImuSensorConfig {
             accel_bias_walk: 1.0e-4,
             gyro_bias_sd: 3.0e-3,
             accel_bias_sd: 5.0e-2,
+            gyro_scale_error: 0.0,
+            accel_scale_error: 0.0,
+            gaps: Vec::new(),
             gravity: 9.81,
         }
     }
@@ -185,6 +194,8 @@ impl SceneConfig {
             ("camera.fx", self.camera.fx),
             ("camera.fy", self.camera.fy),
             ("imu.rate", self.imu.rate),
+            ("imu.gravity", self.imu.gravity),
+            ("room.texel", self.room.texel),
             ("room.size[0]", self.room.size[0]),
             ("room.size[1]", self.room.size[1]),
             ("room.size[2]", self.room.size[2]),
@@ -217,6 +228,29 @@ impl SceneConfig {
             require(valid, key, value, "must be zero or more, and finite")?;
         }
         require(self.duration <= 86_400.0, "duration", self.duration, "must be at most a day")?;
+        for (key, error) in [
+            ("imu.gyro_scale_error", self.imu.gyro_scale_error),
+            ("imu.accel_scale_error", self.imu.accel_scale_error),
+        ] {
+            require(error.abs() < 1.0, key, error, "must be between -1 and 1")?;
+        }
+        for (key, fraction) in [
+            ("room.richness", self.room.richness),
+            ("image.vignetting", self.image.vignetting),
+            ("dropout.anywhere", self.dropout.anywhere),
+            ("dropout.edges", self.dropout.edges),
+            ("dropout.grazing_cosine", self.dropout.grazing_cosine),
+        ] {
+            require((0.0..=1.0).contains(&fraction), key, fraction, "must be from 0 to 1")?;
+        }
+        for (key, gaps) in [("imu.gaps", &self.imu.gaps), ("image.gaps", &self.image.gaps)] {
+            let valid = gaps.iter().flatten().all(|x| *x >= 0.0 && x.is_finite());
+            require(valid, key, format!("{gaps:?}"), "must be pairs of start and length in s")?;
+        }
+        let offset = self.log.log_time_offset;
+        require(offset.is_finite(), "log.log_time_offset", offset, "must be finite")?;
+        let texel = self.room.texel;
+        require(texel >= 0.002, "room.texel", texel, "must be at least 0.002 m")?;
         let ordered = self.light.keys.windows(2).all(|pair| pair[0][0] < pair[1][0]);
         let usable = self.light.keys.iter().all(|[t, f]| t.is_finite() && *f >= 0.0 && *f < 1e3);
         let keys = format!("{:?}", self.light.keys);
@@ -308,6 +342,20 @@ mod tests {
         assert_eq!(scene.camera.fx, structure_core_camera().fx);
         assert_eq!(scene.camera.time_offset, 0.01);
         assert_eq!(SceneConfig::from_toml("").unwrap(), SceneConfig::default());
+    }
+
+    #[test]
+    fn every_recipe_is_a_valid_scene() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("datasets");
+        let mut recipes = 0;
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.extension().is_some_and(|e| e == "toml") {
+                SceneConfig::from_file(&path).unwrap().validate().unwrap();
+                recipes += 1;
+            }
+        }
+        assert!(recipes >= 9);
     }
 
     #[test]

@@ -45,8 +45,12 @@ impl ImuSimulator {
         let accel_noise = normal(&mut self.rng) * (config.accel_noise * per_sample);
         ImuSample {
             stamp,
-            angular_velocity: state.angular_velocity + self.gyro_bias + gyro_noise,
-            specific_force: state.specific_force(config.gravity) + self.accel_bias + accel_noise,
+            angular_velocity: state.angular_velocity * (1.0 + config.gyro_scale_error)
+                + self.gyro_bias
+                + gyro_noise,
+            specific_force: state.specific_force(config.gravity) * (1.0 + config.accel_scale_error)
+                + self.accel_bias
+                + accel_noise,
         }
     }
 }
@@ -150,7 +154,7 @@ mod tests {
             accel_bias_walk: 0.1,
             gyro_bias_sd: 0.0,
             accel_bias_sd: 0.0,
-            gravity: 9.81,
+            ..ImuSensorConfig::default()
         };
         let still = Motion::built_in(
             &MotionConfig { standstill: 1e6, ..MotionConfig::default() },

@@ -46,6 +46,8 @@ pub enum MotionKind {
     Corridor,
     /// Walking around a hall.
     Hall,
+    /// The circle of W22 5.2.2, radius 3 m, one metre up and down, looking along the path.
+    Circle,
 }
 
 /// How the sensor moves.
@@ -53,7 +55,7 @@ pub enum MotionKind {
 #[serde(default, deny_unknown_fields)]
 pub struct MotionConfig {
     /// Shape of the built-in motion, where no trajectory is given: `"lab-simple"`, `"lab-motion"`, `"lab-bumper"`, `"lab-light"`,
-    /// `"lab-dynamic"`, `"corridor"` or `"hall"`.
+    /// `"lab-dynamic"`, `"corridor"`, `"hall"` or `"circle"`.
     pub kind: MotionKind,
     /// Factor on the pace: 2 runs through the same path twice as fast.
     pub speed: f64,
@@ -140,7 +142,7 @@ pub struct Motion {
 #[derive(Debug, Clone)]
 enum Curve {
     BuiltIn {
-        path: Path,
+        path: Box<Path>,
         /// Rotation of the IMU in the camera's forward-left-up frame.
         level_from_body: UnitQuaternion<f64>,
     },
@@ -151,7 +153,7 @@ impl Motion {
     /// A built-in motion; `body_from_camera` tells how the body is held so that the camera looks
     /// ahead, `seed` sets the phases.
     pub fn built_in(config: &MotionConfig, body_from_camera: &Isometry3<f64>, seed: u64) -> Self {
-        let path = path(config.kind, &mut ChaCha8Rng::seed_from_u64(seed));
+        let path = Box::new(path(config.kind, &mut ChaCha8Rng::seed_from_u64(seed)));
         let level_from_body = level_from_camera() * body_from_camera.rotation.inverse();
         Self { curve: Curve::BuiltIn { path, level_from_body }, pace: Pace::new(config) }
     }
@@ -285,6 +287,7 @@ fn path(kind: MotionKind, rng: &mut ChaCha8Rng) -> Path {
         MotionKind::LabBumper => wheeled(rng),
         MotionKind::Corridor => corridor(rng),
         MotionKind::Hall => hall(rng),
+        MotionKind::Circle => circle(),
     }
 }
 
@@ -393,11 +396,37 @@ fn hall(rng: &mut ChaCha8Rng) -> Path {
     walking(path, rng)
 }
 
+/// W22 gives mean acceleration and angular velocity; a round in 16 s and two waves in it agree
+/// with them. The path is raised by 1 m, so that the camera does not touch the floor.
+fn circle() -> Path {
+    let (radius, turns, waves, lift) = (3.0, 1.0 / 16.0, 1.0 / 8.0, 0.5);
+    let quarter = std::f64::consts::FRAC_PI_2;
+    // The slope is atan(s cos(phase)), whose Fourier series is in odd powers of r.
+    let slope: f64 = lift * waves / (radius * turns);
+    let r = ((1.0 + slope * slope).sqrt() - 1.0) / slope;
+    let pitch = (0..5).fold(Signal::default(), |pitch, k| {
+        let order = f64::from(2 * k + 1);
+        let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+        pitch.wave(sign * 2.0 * r.powf(order) / order, order * waves, quarter)
+    });
+    Path {
+        position: [
+            Signal::default().wave(radius, turns, quarter),
+            Signal::default().wave(radius, turns, 0.0),
+            Signal::offset(1.5).wave(lift, waves, 0.0),
+        ],
+        yaw: Signal::offset(quarter).drift(turns * std::f64::consts::TAU),
+        pitch,
+        roll: Signal::default(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const KINDS: [MotionKind; 5] = [
+    const KINDS: [MotionKind; 6] = [
+        MotionKind::Circle,
         MotionKind::LabSimple,
         MotionKind::LabMotion,
         MotionKind::LabBumper,
@@ -430,6 +459,27 @@ mod tests {
                 assert!((rate - now.angular_velocity).norm() < 1e-6, "{kind:?} {t}");
             }
         }
+    }
+
+    #[test]
+    fn the_circle_looks_along_its_path_and_has_the_means_of_the_paper() {
+        let config = MotionConfig {
+            kind: MotionKind::Circle,
+            standstill: 0.0,
+            ramp: 0.0,
+            ..MotionConfig::default()
+        };
+        let motion = Motion::built_in(&config, &Isometry3::identity(), 1);
+        let (mut acceleration, mut rate) = (0.0, 0.0);
+        for k in 0..1600 {
+            let state = motion.state(0.01 * f64::from(k) + 1e-3);
+            let ahead = state.world_from_body.rotation * Vector3::z();
+            assert!(ahead.angle(&state.velocity) < 1e-5);
+            acceleration += state.acceleration.norm() / 1600.0;
+            rate += state.angular_velocity.norm().to_degrees() / 1600.0;
+        }
+        assert!((acceleration - 0.51_f64).abs() < 0.01, "{acceleration}");
+        assert!((rate - 24.7).abs() < 1.0, "{rate}");
     }
 
     #[test]

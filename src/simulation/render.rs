@@ -21,6 +21,8 @@ pub struct ImageConfig {
     pub height: usize,
     /// Frames per second.
     pub rate: f64,
+    /// Spans without frames: start and length, s.
+    pub gaps: Vec<[f64; 2]>,
     /// Factor on the light that reaches the sensor.
     pub exposure: f64,
     /// Standard deviation of the noise of each channel at exposure 1, in steps of 1/255. The
@@ -38,7 +40,8 @@ impl Default for ImageConfig {
             width: 640,
             height: 480,
             rate: 30.0,
-            exposure: 1.0,
+            gaps: Vec::new(),
+            exposure: 1.2,
             noise: 2.0,
             vignetting: 0.2,
             shutter: 0.004,
@@ -121,6 +124,7 @@ impl Lens {
 }
 
 impl Scene<'_> {
+    #[inline]
     fn trace(&self, column: f32, row: f32, candidates: &[usize]) -> Sample {
         let (x, y) = self.camera.direction(column, row);
         let mut nearest: Option<(usize, super::world::Hit)> = None;
@@ -220,9 +224,9 @@ impl Renderer {
     fn smooth_edges(&self, scene: &Scene, samples: &[Sample], row: usize, colors: &mut [[f32; 3]]) {
         let mut candidates = Vec::new();
         for (column, color) in colors.iter_mut().enumerate() {
-            let around = self.neighbours(samples, column, row);
-            *color = around.center.color;
-            if around.surface_edge() {
+            let (sample, around) = self.neighbours(samples, column, row);
+            *color = sample.color;
+            if around.iter().any(|s| s.surface != sample.surface) {
                 let (x, y) = (column as f32, row as f32);
                 scene.candidates(x - 1.0, y - 1.0, x + 1.0, y + 1.0, &mut candidates);
                 *color = supersampled(scene, x, y, &candidates);
@@ -230,16 +234,23 @@ impl Renderer {
         }
     }
 
-    fn neighbours(&self, samples: &[Sample], column: usize, row: usize) -> Neighbours {
+    /// The four samples next to one; at the border, the sample itself.
+    #[inline]
+    fn neighbours<'a>(
+        &self,
+        samples: &'a [Sample],
+        column: usize,
+        row: usize,
+    ) -> (&'a Sample, [&'a Sample; 4]) {
         let (width, height) = (self.image.width, self.image.height);
-        let at = |x: usize, y: usize| samples[y * width + x];
+        let at = |x: usize, y: usize| &samples[y * width + x];
         let around = [
             at(column.saturating_sub(1), row),
             at((column + 1).min(width - 1), row),
             at(column, row.saturating_sub(1)),
             at(column, (row + 1).min(height - 1)),
         ];
-        Neighbours { center: at(column, row), around }
+        (at(column, row), around)
     }
 
     fn scene(&self, world_from_camera: &Isometry3<f64>) -> Scene<'_> {
@@ -290,8 +301,8 @@ impl Renderer {
         let middle = [0.5 * (width as f32 - 1.0), 0.5 * (height as f32 - 1.0)];
         let corner = (middle[0] * middle[0] + middle[1] * middle[1]).max(1.0);
         for column in 0..width {
-            let around = self.neighbours(film.samples, column, row);
-            let value = film.blurred(width, height, column, row, around.center.depth);
+            let (sample, around) = self.neighbours(film.samples, column, row);
+            let value = film.blurred(width, height, column, row, sample.depth);
             let (x, y) = (column as f32 - middle[0], row as f32 - middle[1]);
             let light = 1.0 - self.image.vignetting as f32 * (x * x + y * y) / corner;
             let factor = gain * light.max(0.0).sqrt();
@@ -300,15 +311,17 @@ impl Renderer {
                 let grain = sd * self.quantile(random >> (12 * k));
                 color[3 * column + k] = (value * factor + grain + 0.5).clamp(0.0, 255.0) as u8;
             }
-            depth[column] = self.measured_depth(&around, random >> 36);
+            depth[column] = self.measured_depth(sample, &around, random >> 36);
         }
     }
 
     /// Depth in mm from 28 random bits; 0 where there is none.
-    fn measured_depth(&self, around: &Neighbours, random: u64) -> u16 {
-        let sample = around.center;
+    fn measured_depth(&self, sample: &Sample, around: &[&Sample; 4], random: u64) -> u16 {
         let chance = ((random >> 12) & 0xffff) as f64 / 65536.0;
-        let edge = around.depth_edge(self.depth.edge_fraction as f32);
+        let step = self.depth.edge_fraction as f32 * sample.depth;
+        let edge = around
+            .iter()
+            .any(|s| s.surface != sample.surface && (s.depth - sample.depth).abs() > step);
         let lost = if edge { self.dropout.edges } else { self.dropout.anywhere };
         if chance < lost || f64::from(sample.cosine) < self.dropout.grazing_cosine {
             return 0;
@@ -403,7 +416,7 @@ impl Film<'_> {
     fn blurred(&self, width: usize, height: usize, column: usize, row: usize, z: f32) -> [f32; 3] {
         const MAX_TAPS: f32 = 24.0;
         let path = self.blur.path(column as f32, row as f32, z);
-        let taps = path[0].hypot(path[1]).ceil().clamp(1.0, MAX_TAPS);
+        let taps = (path[0] * path[0] + path[1] * path[1]).sqrt().ceil().clamp(1.0, MAX_TAPS);
         if taps == 1.0 {
             return self.colors[row * width + column];
         }
@@ -419,31 +432,18 @@ impl Film<'_> {
     }
 }
 
-/// A sample and the four next to it.
-struct Neighbours {
-    center: Sample,
-    around: [Sample; 4],
-}
-
-impl Neighbours {
-    fn surface_edge(&self) -> bool {
-        self.around.iter().any(|s| s.surface != self.center.surface)
-    }
-
-    fn depth_edge(&self, fraction: f32) -> bool {
-        let limit = fraction * self.center.depth;
-        self.surface_edge()
-            && self.around.iter().any(|s| (s.depth - self.center.depth).abs() > limit)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::world::{PeopleConfig, RoomConfig};
     use super::*;
 
+    /// Coarsely textured, to be quick.
+    fn small_room() -> RoomConfig {
+        RoomConfig { size: [6.0, 5.0, 2.8], texel: 0.03, ..RoomConfig::default() }
+    }
+
     fn renderer(noise: f64) -> Renderer {
-        let room = RoomConfig { size: [6.0, 5.0, 2.8], clutter: 6, ..RoomConfig::default() };
+        let room = RoomConfig { clutter: 4, ..small_room() };
         let world = World::furnished(&room, &PeopleConfig::default(), &[Vector3::zeros()], 1);
         let camera = PinholeCamera { fx: 120.0, fy: 120.0, cx: 79.5, cy: 59.5 };
         let image = ImageConfig { width: 160, height: 120, noise, ..ImageConfig::default() };
@@ -477,7 +477,7 @@ mod tests {
 
     #[test]
     fn an_empty_room_has_the_depth_of_its_walls() {
-        let room = RoomConfig { size: [6.0, 5.0, 2.8], clutter: 0, ..RoomConfig::default() };
+        let room = RoomConfig { clutter: 0, ..small_room() };
         let world = World::furnished(&room, &PeopleConfig::default(), &[], 1);
         let mut renderer = Renderer { world, ..renderer(0.0) };
         renderer.dropout = DropoutConfig { anywhere: 0.0, edges: 0.0, grazing_cosine: 0.0 };

@@ -1,3 +1,6 @@
+use std::ops::ControlFlow;
+use std::sync::mpsc::sync_channel;
+
 use nalgebra::{Isometry3, Vector3};
 
 use super::config::{SceneConfig, SceneError};
@@ -5,9 +8,10 @@ use super::inertial::ImuSimulator;
 use super::motion::{BodyState, Motion};
 use super::render::{Renderer, Shot};
 use super::world::{RoomConfig, World};
-use crate::dataset::{Event, LogWriter, RgbdFrame, TruthPose, WriteError};
+use crate::dataset::{LogWriter, WriteError, WriteSummary};
 use crate::inertial::Stamp;
-use crate::vision::PinholeCamera;
+use crate::odometry::{Event, TruthPose};
+use crate::vision::{PinholeCamera, RgbdFrame};
 
 /// Runs through a scene and yields what its sensors see, ordered by stamp.
 pub struct Simulation {
@@ -22,23 +26,43 @@ pub struct Simulation {
     frames: Ticks,
 }
 
-/// Times `k / rate` up to a duration, exact for any `k`.
-#[derive(Debug, Clone, Copy)]
+/// Times `k / rate` up to a duration, without those in gaps.
+#[derive(Debug, Clone)]
 struct Ticks {
     next: u64,
     rate: f64,
     duration: f64,
+    /// Start and length, s.
+    gaps: Vec<[f64; 2]>,
 }
 
 impl Ticks {
-    fn new(rate: f64, duration: f64) -> Self {
-        Self { next: 0, rate, duration }
+    fn new(rate: f64, duration: f64, gaps: &[[f64; 2]]) -> Self {
+        let mut ticks = Self { next: 0, rate, duration, gaps: gaps.to_vec() };
+        ticks.skip_gaps();
+        ticks
     }
 
     /// Time of the next tick (s), infinite at the end.
     fn time(&self) -> f64 {
         let time = self.next as f64 / self.rate;
         if self.rate > 0.0 && time <= self.duration { time } else { f64::INFINITY }
+    }
+
+    /// Number of the next tick; goes on to the one after it.
+    fn take(&mut self) -> u64 {
+        let number = self.next;
+        self.next += 1;
+        self.skip_gaps();
+        number
+    }
+
+    fn skip_gaps(&mut self) {
+        let missing =
+            |t: f64| self.gaps.iter().any(|[start, length]| t >= *start && t < start + length);
+        while self.time().is_finite() && missing(self.time()) {
+            self.next += 1;
+        }
     }
 }
 
@@ -72,9 +96,10 @@ impl Simulation {
             seed(3),
         );
         let imu = ImuSimulator::new(config.imu.clone(), seed(4));
-        let ticks = |rate| Ticks::new(rate, config.duration);
-        let (imu_samples, truth_poses, frames) =
-            (ticks(config.imu.rate), ticks(config.truth.rate), ticks(config.image.rate));
+        let ticks = |rate, gaps| Ticks::new(rate, config.duration, gaps);
+        let imu_samples = ticks(config.imu.rate, &config.imu.gaps);
+        let truth_poses = ticks(config.truth.rate, &[]);
+        let frames = ticks(config.image.rate, &config.image.gaps);
         Ok(Self {
             config,
             motion,
@@ -102,9 +127,33 @@ impl Simulation {
         self.motion.state(stamp.seconds_since(self.start))
     }
 
-    /// Writes the mounting of the camera; to be called before the first event is written.
-    pub fn write_calibration(&self, log: &mut LogWriter) -> Result<(), WriteError> {
-        log.camera_info(&self.config.camera, self.start)
+    /// Writes all of it to a log, compressing while the next frames are rendered. `watch` sees
+    /// each event first and may end the log early; what was written until then is valid.
+    pub fn write(
+        self,
+        mut log: LogWriter,
+        mut watch: impl FnMut(&Event) -> ControlFlow<()>,
+    ) -> Result<WriteSummary, WriteError> {
+        // Five frames or so may wait for the disk.
+        const WAITING: usize = 64;
+        log.camera_info(&self.config.camera, self.start)?;
+        let (sender, receiver) = sync_channel::<Event>(WAITING);
+        std::thread::scope(|scope| {
+            let writer = scope.spawn(move || {
+                for event in receiver {
+                    log.event(&event)?;
+                }
+                log.finish()
+            });
+            for event in self {
+                // A writer that failed has hung up; its error comes from `join`.
+                if watch(&event).is_break() || sender.send(event).is_err() {
+                    break;
+                }
+            }
+            drop(sender);
+            writer.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        })
     }
 
     /// Pose and motion of the camera at a stamp of the IMU's clock.
@@ -145,19 +194,19 @@ impl Iterator for Simulation {
             return None;
         }
         if imu == earliest {
-            self.imu_samples.next += 1;
+            self.imu_samples.take();
             let stamp = self.start.offset_by(imu);
             let state = self.state(stamp);
             return Some(Event::Imu(self.imu.sample(stamp, &state)));
         }
         if truth == earliest {
-            self.truth_poses.next += 1;
+            self.truth_poses.take();
             let stamp = self.start.offset_by(truth);
             let world_from_body = self.state(stamp).world_from_body;
             return Some(Event::Truth(TruthPose { stamp, world_from_body }));
         }
-        let (number, stamp) = (self.frames.next, self.start.offset_by(self.frames.time()));
-        self.frames.next += 1;
+        let stamp = self.start.offset_by(self.frames.time());
+        let number = self.frames.take();
         self.frame(stamp, number).map(|frame| Event::Frame(Box::new(frame)))
     }
 }
@@ -201,7 +250,7 @@ mod tests {
     /// A quarter-size camera in a small room, without noise.
     fn small_scene() -> SceneConfig {
         let mut scene = SceneConfig { duration: 3.0, ..SceneConfig::default() };
-        scene.room = RoomConfig { size: [4.5, 4.5, 2.6], clutter: 8, ..scene.room };
+        scene.room = RoomConfig { size: [4.5, 4.5, 2.6], clutter: 6, texel: 0.015, ..scene.room };
         scene.motion.standstill = 0.5;
         scene.image.width = 160;
         scene.image.height = 120;
@@ -247,10 +296,11 @@ mod tests {
         let mut scene = small_scene();
         scene.duration = 1.0;
         scene.camera.time_offset = 0.02;
+        scene.imu.gaps = vec![[0.5, 0.1]];
         let events: Vec<Event> = Simulation::new(scene).unwrap().collect();
         assert!(events.windows(2).all(|pair| pair[0].stamp() <= pair[1].stamp()));
         let count = |pick: fn(&Event) -> bool| events.iter().filter(|e| pick(e)).count();
-        assert_eq!(count(|e| matches!(e, Event::Imu(_))), 201);
+        assert_eq!(count(|e| matches!(e, Event::Imu(_))), 181);
         assert_eq!(count(|e| matches!(e, Event::Truth(_))), 121);
         assert_eq!(count(|e| matches!(e, Event::Frame(_))), 11);
     }
@@ -304,6 +354,24 @@ mod tests {
         // What is hidden in one of the frames may disagree.
         assert!(f64::from(agreeing) > 0.9 * f64::from(seen), "{agreeing} of {seen}");
         assert!(difference[1..].iter().all(|d| *d > 1.15 * difference[0]), "{difference:?}");
+    }
+
+    #[test]
+    fn a_log_may_end_early_and_is_valid() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log.mcap");
+        let simulation = Simulation::new(small_scene()).unwrap();
+        let log = LogWriter::create(&path, simulation.config().log.clone()).unwrap();
+        let until = simulation.start().offset_by(0.3);
+        let watch = |event: &Event| {
+            if event.stamp() < until { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        };
+        let summary = simulation.write(log, watch).unwrap();
+        assert_eq!((summary.frames, summary.imu_samples, summary.truth_poses), (3, 60, 36));
+        let bytes = std::fs::read(&path).unwrap();
+        let statistics = mcap::Summary::read(&bytes).unwrap().unwrap().stats.unwrap();
+        // The static transform, three messages a frame, IMU and truth.
+        assert_eq!(statistics.message_count, 1 + 9 + 60 + 36);
     }
 
     #[test]

@@ -134,13 +134,13 @@ impl<const D: usize> Banded<D> {
                 let rest = self.rows[i][k] - shared;
                 self.rows[i][k] = if k > 0 { rest / self.rows[j][0] } else { rest.sqrt() };
             }
-            // Also false for the square root of a negative number.
-            if !(self.rows[i][0] > 0.0) {
+            let pivot = self.rows[i][0];
+            if pivot.is_nan() || pivot <= 0.0 {
                 return None;
             }
             let known = (1..=reach).map(|m| self.right[i - m] * self.rows[i][m]);
             let known = known.fold(SVector::zeros(), |sum: SVector<f64, D>, x| sum + x);
-            self.right[i] = (self.right[i] - known) / self.rows[i][0];
+            self.right[i] = (self.right[i] - known) / pivot;
         }
         for i in (0..n).rev() {
             self.right[i] /= self.rows[i][0];

@@ -47,24 +47,30 @@ impl Level {
         Self { width, height, texels }
     }
 
-    /// Bilinear value at texel coordinates (0 is the centre of the first texel).
-    fn bilinear(&self, x: f32, y: f32, wraps: bool) -> [f32; 4] {
-        let (left, top) = (x.floor(), y.floor());
-        let (fx, fy) = (x - left, y - top);
-        let column = |offset: i32| index(left as i32 + offset, self.width, wraps);
-        let row = |offset: i32| index(top as i32 + offset, self.height, wraps) * self.width;
-        let (x0, x1, y0, y1) = (column(0), column(1), row(0), row(1));
-        let corner = |i: usize| self.texels[i].map(f32::from);
-        let (a, b) = (corner(y0 + x0), corner(y0 + x1));
-        let (c, d) = (corner(y1 + x0), corner(y1 + x1));
-        std::array::from_fn(|k| {
-            let upper = a[k] + (b[k] - a[k]) * fx;
-            let lower = c[k] + (d[k] - c[k]) * fx;
-            upper + (lower - upper) * fy
-        })
+    /// Bilinear value at texel coordinates (0 is the centre of the first texel), in steps of
+    /// 1/256 of a texel. Integers, two channels to a word: this is where rendering spends its
+    /// time.
+    #[inline]
+    fn bilinear(&self, x: f32, y: f32, wraps: bool) -> [f32; 3] {
+        const PAIR: u32 = 0x00ff_00ff;
+        let (x, y) = ((x * 256.0) as i32, (y * 256.0) as i32);
+        let (fx, fy) = ((x & 255) as u32, (y & 255) as u32);
+        let (column, row) = (x >> 8, y >> 8);
+        let (x0, x1) = (index(column, self.width, wraps), index(column + 1, self.width, wraps));
+        let (y0, y1) = (index(row, self.height, wraps), index(row + 1, self.height, wraps));
+        let line = |y: usize| {
+            let texel = |x: usize| u32::from_le_bytes(self.texels[y * self.width + x]);
+            let (a, b) = (texel(x0), texel(x1));
+            let pair = |a: u32, b: u32| (a & PAIR) * (256 - fx) + (b & PAIR) * fx;
+            (pair(a, b), pair(a >> 8, b >> 8))
+        };
+        let ((rb0, g0), (rb1, g1)) = (line(y0), line(y1));
+        let mix = |a: u32, b: u32| ((a & 0xffff) * (256 - fy) + (b & 0xffff) * fy) as f32;
+        [mix(rb0, rb1), mix(g0, g1), mix(rb0 >> 16, rb1 >> 16)].map(|c| c / 65536.0)
     }
 }
 
+#[inline]
 fn index(i: i32, len: usize, wraps: bool) -> usize {
     if wraps { i.rem_euclid(len as i32) as usize } else { i.clamp(0, len as i32 - 1) as usize }
 }
@@ -72,37 +78,52 @@ fn index(i: i32, len: usize, wraps: bool) -> usize {
 impl Texture {
     /// The mean over the parallelogram spanned by `dx` and `dy` (m) around `(u, v)` (m), by up to
     /// four trilinear samples along its longer side.
+    #[inline]
     pub fn sample(&self, u: f32, v: f32, dx: [f32; 2], dy: [f32; 2]) -> Color {
         const MAX_SAMPLES: f32 = 4.0;
-        let (lx, ly) = (dx[0].hypot(dx[1]), dy[0].hypot(dy[1]));
+        let length = |e: [f32; 2]| (e[0] * e[0] + e[1] * e[1]).sqrt();
+        let (lx, ly) = (length(dx), length(dy));
         let (long, axis, short) = if lx > ly { (lx, dx, ly) } else { (ly, dy, lx) };
         let width = short.max(long / MAX_SAMPLES).max(1e-6);
-        let samples = (long / width).round().clamp(1.0, MAX_SAMPLES);
-        let lod = (width / self.texel).log2();
-        let mut sum = [0.0_f32; 4];
-        for i in 0..samples as usize {
-            let along = (i as f32 + 0.5) / samples - 0.5;
-            let value = self.trilinear(u + along * axis[0], v + along * axis[1], lod);
-            sum.iter_mut().zip(value).for_each(|(s, x)| *s += x);
+        let samples = (long / width + 0.5) as usize;
+        if samples < 2 {
+            return self.trilinear(u, v, width);
         }
-        [sum[0] / samples, sum[1] / samples, sum[2] / samples]
+        let step = 1.0 / samples as f32;
+        let mut sum = [0.0_f32; 3];
+        for i in 0..samples {
+            let along = (i as f32 + 0.5) * step - 0.5;
+            let value = self.trilinear(u + along * axis[0], v + along * axis[1], width);
+            sum.iter_mut().zip(value).for_each(|(s, x)| *s += x * step);
+        }
+        sum
     }
 
-    fn trilinear(&self, u: f32, v: f32, lod: f32) -> [f32; 4] {
-        let lod = lod.clamp(0.0, (self.levels.len() - 1) as f32);
-        let fine = lod as usize;
-        let blend = lod - fine as f32;
+    /// Value for a square footprint of `width` m, between the two nearest levels.
+    #[inline]
+    pub fn trilinear(&self, u: f32, v: f32, width: f32) -> Color {
+        // Exponent and mantissa of the ratio are a good enough logarithm.
+        let bits = (width / self.texel).max(1.0).to_bits();
+        let fine = (bits >> 23) as usize - 127;
+        // Blending only halfway between levels saves half of the second look-ups unseen.
+        let blend = (2.0 * (bits & 0x7f_ffff) as f32 / 8_388_608.0 - 0.5).clamp(0.0, 1.0);
+        let coarsest = self.levels.len() - 1;
         let at = |level: usize| {
-            let texel = self.texel * (1_u32 << level) as f32;
-            self.levels[level].bilinear(u / texel - 0.5, v / texel - 0.5, self.wraps)
+            let scale = 1.0 / (self.texel * (1_u32 << level) as f32);
+            self.levels[level].bilinear(u * scale - 0.5, v * scale - 0.5, self.wraps)
         };
-        let a = at(fine);
-        if blend < 0.02 || fine + 1 == self.levels.len() {
-            return a;
+        if fine >= coarsest || blend == 0.0 {
+            return at(fine.min(coarsest));
         }
-        let b = at(fine + 1);
+        if blend == 1.0 {
+            return at(fine + 1);
+        }
+        let (a, b) = (at(fine), at(fine + 1));
         std::array::from_fn(|k| a[k] + (b[k] - a[k]) * blend)
     }
+
+    /// Footprints above this see nothing of [`Self::fine_grain`], m.
+    pub const FINE_GRAIN_LIMIT: f32 = 0.01;
 
     /// A grey pattern of 2 cm shapes and below, `512 x 512` texels of 0.6 mm, that wraps around;
     /// laid over the larger textures it gives close views something to see. Its mean is 128.
@@ -140,32 +161,39 @@ fn power_law_radius(rng: &mut ChaCha8Rng, min: f32, max: f32) -> f32 {
 #[derive(Debug, Clone, Copy)]
 enum Shape {
     Disc,
-    Triangle { angle: f32 },
-    Rectangle { angle: f32, aspect: f32 },
+    /// Outward normals of the sides.
+    Triangle([[f32; 2]; 3]),
+    /// Direction of the long side; ratio of the sides.
+    Rectangle {
+        along: [f32; 2],
+        aspect: f32,
+    },
 }
 
 impl Shape {
     fn random(rng: &mut ChaCha8Rng) -> Self {
+        const THIRD: f32 = std::f32::consts::TAU / 3.0;
         let angle = rng.random_range(0.0..std::f32::consts::TAU);
+        let direction = |turn: f32| {
+            let (s, c) = (angle + turn).sin_cos();
+            [c, s]
+        };
         match rng.random_range(0..4) {
             0 => Self::Disc,
-            1 => Self::Triangle { angle },
-            _ => Self::Rectangle { angle, aspect: rng.random_range(0.25..1.0) },
+            1 => Self::Triangle([0.0, THIRD, 2.0 * THIRD].map(direction)),
+            _ => Self::Rectangle { along: direction(0.0), aspect: rng.random_range(0.25..1.0) },
         }
     }
 
     /// Signed distance (approximate outside of corners) to a shape of circumradius `radius`.
-    fn distance(self, x: f32, y: f32, radius: f32) -> f32 {
+    fn distance(&self, x: f32, y: f32, radius: f32) -> f32 {
         match self {
-            Self::Disc => x.hypot(y) - radius,
-            Self::Triangle { angle } => (0..3)
-                .map(|k| {
-                    let (s, c) = (angle + k as f32 * std::f32::consts::TAU / 3.0).sin_cos();
-                    c * x + s * y - 0.5 * radius
-                })
-                .fold(f32::MIN, f32::max),
-            Self::Rectangle { angle, aspect } => {
-                let (s, c) = angle.sin_cos();
+            Self::Disc => (x * x + y * y).sqrt() - radius,
+            Self::Triangle(normals) => {
+                let farthest = normals.iter().map(|n| n[0] * x + n[1] * y).fold(f32::MIN, f32::max);
+                farthest - 0.5 * radius
+            }
+            Self::Rectangle { along: [c, s], aspect } => {
                 let (along, across) = (c * x + s * y, c * y - s * x);
                 (along.abs() - radius).max(across.abs() - aspect * radius)
             }
@@ -247,6 +275,7 @@ impl Canvas {
             let last = (center + reach).min(low + size) * per_metre;
             (first.floor().max(0.0) as usize, (last.ceil().max(0.0) as usize).min(count))
         };
+        let packed = pack(color);
         let clip = self.clip;
         let (x0, x1) = range(center[0], reach[0] + self.texel, clip.x, clip.width, self.columns);
         let (y0, y1) = range(center[1], reach[1] + self.texel, clip.y, clip.height, self.rows);
@@ -255,8 +284,11 @@ impl Canvas {
             for column in x0..x1 {
                 let x = (column as f32 + 0.5) * self.texel - center[0];
                 let alpha = opacity * (0.5 - distance(x, y) * per_metre).clamp(0.0, 1.0);
-                if alpha > 0.0 {
-                    blend(&mut self.texels[row * self.columns + column], color, alpha);
+                let texel = &mut self.texels[row * self.columns + column];
+                if alpha >= 1.0 {
+                    *texel = packed;
+                } else if alpha > 0.0 {
+                    blend(texel, color, alpha);
                 }
             }
         }
@@ -333,12 +365,12 @@ impl Canvas {
         }
     }
 
-    /// Multiplies by fractal value noise: octaves of period `period`, half of it, ... (m), each
-    /// weaker by 0.7; `stretch` lengthens it along `u`.
+    /// Multiplies by fractal value noise: four octaves of period `period`, half of it, ... (m),
+    /// each weaker by 0.7; `stretch` lengthens it along `u`.
     fn grain(&mut self, rng: &mut ChaCha8Rng, period: f32, stretch: f32, amplitude: f32) {
         let mut factors = vec![0.0_f32; self.texels.len()];
-        let (mut period, mut weight) = (period / self.texel, amplitude);
-        while period >= 1.5 {
+        let (mut period, mut weight) = ((period / self.texel).max(1.5), amplitude);
+        for _ in 0..4 {
             let (px, py) = (period * stretch, period);
             let columns = (self.columns as f32 / px) as usize + 2;
             let rows = (self.rows as f32 / py) as usize + 2;
@@ -357,7 +389,7 @@ impl Canvas {
                     *factor += a + (b - a) * fy;
                 }
             }
-            period /= 2.0;
+            period = (period / 2.0).max(1.5);
             weight *= 0.7;
         }
         for (texel, factor) in self.texels.iter_mut().zip(factors) {
@@ -441,16 +473,27 @@ pub enum Material {
     Print,
 }
 
-/// Paints one face of `width` by `height` metres; `richness` from 0 (bare) to 1 (busy).
+impl Material {
+    /// Contrast of the fine grain laid over it, 0 to 1.
+    pub fn grain_depth(self) -> f32 {
+        match self {
+            Self::Wall | Self::Ceiling => 0.12,
+            Self::Books | Self::Print => 0.2,
+            Self::Floor | Self::Carton | Self::Wood => 0.3,
+        }
+    }
+}
+
+/// Paints one face of `width` by `height` metres; `richness` from 0 (bare) to 1 (busy). Texels of
+/// large faces have an edge of `texel` m, those of small ones down to half of it.
 pub fn paint(
     material: Material,
-    width: f32,
-    height: f32,
+    [width, height]: [f32; 2],
+    texel: f32,
     richness: f32,
     rng: &mut ChaCha8Rng,
 ) -> Texture {
-    // About a million texels for the largest faces of a room; close up, the fine grain helps.
-    let texel = ((width * height).sqrt() / 1024.0).clamp(0.0015, 0.005);
+    let texel = ((width * height).sqrt() / 700.0).clamp(0.5 * texel, texel);
     let columns = (width / texel).ceil().max(1.0) as usize;
     let rows = (height / texel).ceil().max(1.0) as usize;
     let mut canvas = Canvas::new(columns, rows, texel, [128.0; 3]);
@@ -471,8 +514,8 @@ pub fn paint(
 
 fn wall(canvas: &mut Canvas, rng: &mut ChaCha8Rng, richness: f32) {
     let whole = canvas.whole();
-    let tint = rng.random_range(0.0..1.0);
-    canvas.area(whole, from_hsv(tint, 0.08, 205.0), 1.0);
+    let tint = from_hsv(rng.random(), rng.random_range(0.03..0.2), rng.random_range(165.0..225.0));
+    canvas.area(whole, tint, 1.0);
     let marks = Leaves {
         min_radius: 0.006,
         max_radius: 0.35,
@@ -482,9 +525,13 @@ fn wall(canvas: &mut Canvas, rng: &mut ChaCha8Rng, richness: f32) {
     };
     canvas.leaves(rng, whole, &marks);
     canvas.grain(rng, 0.8, 1.0, 0.05);
-    let hung = (richness * 1.5 * whole.width * whole.height) as usize;
+    if whole.width > 2.0 && whole.height > 2.2 {
+        door(canvas, rng);
+        window(canvas, rng);
+    }
+    let hung = (richness * 1.8 * whole.width * whole.height) as usize;
     for _ in 0..hung {
-        let w = power_law_radius(rng, 0.16, 0.9).min(0.7 * whole.width);
+        let w = power_law_radius(rng, 0.18, 1.3).min(0.7 * whole.width);
         let h = (w * rng.random_range(0.6..1.5)).min(0.7 * whole.height);
         let area = Area {
             x: rng.random::<f32>() * (whole.width - w),
@@ -497,12 +544,44 @@ fn wall(canvas: &mut Canvas, rng: &mut ChaCha8Rng, richness: f32) {
     }
 }
 
+fn door(canvas: &mut Canvas, rng: &mut ChaCha8Rng) {
+    let x = rng.random_range(0.1..canvas.width() - 1.1);
+    let leaf = Area { x, y: 0.0, width: 0.95, height: 2.05 };
+    canvas.area(leaf, [225.0, 222.0, 215.0], 1.0);
+    let paint = from_hsv(rng.random(), 0.35, rng.random_range(60.0..130.0));
+    canvas.area(Area { x: x + 0.06, width: 0.83, height: 1.99, ..leaf }, paint, 1.0);
+    for y in [0.15, 1.1] {
+        let panel = Area { x: x + 0.18, y, width: 0.59, height: 0.8 };
+        canvas.area(panel, paint.map(|c| 0.7 * c), 1.0);
+        canvas.area(panel.inset(0.015), paint.map(|c| 1.15 * c), 1.0);
+    }
+    canvas.area(Area { x: x + 0.8, y: 1.0, width: 0.06, height: 0.1 }, [235.0; 3], 1.0);
+}
+
+/// Six bright panes, a little different each.
+fn window(canvas: &mut Canvas, rng: &mut ChaCha8Rng) {
+    let x = rng.random_range(0.1..canvas.width() - 1.5);
+    let frame = Area { x, y: 0.95, width: 1.4, height: 1.1 };
+    canvas.area(frame, [120.0, 112.0, 104.0], 1.0);
+    for i in 0..3 {
+        for j in 0..2 {
+            let pane = Area {
+                x: x + 0.04 + 0.445 * i as f32,
+                y: 0.99 + 0.525 * j as f32,
+                width: 0.42,
+                height: 0.5,
+            };
+            canvas.area(pane, [rng.random_range(225.0..255.0); 3], 1.0);
+        }
+    }
+}
+
 /// A framed picture, a notice or a poster.
 fn sheet(canvas: &mut Canvas, rng: &mut ChaCha8Rng, area: Area) {
     let frame = from_hsv(rng.random(), rng.random_range(0.0..0.5), rng.random_range(30.0..240.0));
     canvas.area(area, frame, 1.0);
     let inner = area.inset(rng.random_range(0.008..0.03));
-    if rng.random::<f32>() < 0.35 {
+    if inner.width < 0.6 && rng.random::<f32>() < 0.5 {
         canvas.area(inner, [rng.random_range(200.0..245.0); 3], 1.0);
         let ink = from_hsv(rng.random(), 0.5, rng.random_range(20.0..110.0));
         let height = rng.random_range(0.012..0.05_f32).min(inner.height / 3.0);
@@ -513,8 +592,8 @@ fn sheet(canvas: &mut Canvas, rng: &mut ChaCha8Rng, area: Area) {
 }
 
 fn picture(canvas: &mut Canvas, rng: &mut ChaCha8Rng, area: Area) {
-    let dark = rng.random_range(15.0..90.0);
-    let light = rng.random_range(150.0..250.0);
+    let dark = rng.random_range(10.0..80.0);
+    let light = rng.random_range(180.0..255.0);
     let palette = Palette::around(rng, 7, dark, light);
     canvas.area(area, palette.pick(rng), 1.0);
     let largest = 0.45 * area.width.max(area.height);
@@ -699,7 +778,7 @@ mod tests {
     #[test]
     fn a_wide_footprint_reads_the_mean() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let texture = paint(Material::Print, 1.0, 1.0, 1.0, &mut rng);
+        let texture = paint(Material::Print, [1.0, 1.0], 0.005, 1.0, &mut rng);
         let level = &texture.levels[0];
         let n = level.texels.len() as f32;
         let mean = level.texels.iter().map(|t| f32::from(t[1])).sum::<f32>() / n;
@@ -710,7 +789,7 @@ mod tests {
     #[test]
     fn a_small_footprint_reads_the_texel() {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
-        let texture = paint(Material::Carton, 0.5, 0.4, 1.0, &mut rng);
+        let texture = paint(Material::Carton, [0.5, 0.4], 0.005, 1.0, &mut rng);
         let level = &texture.levels[0];
         let (column, row) = (37, 21);
         let (u, v) = ((column as f32 + 0.5) * texture.texel, (row as f32 + 0.5) * texture.texel);
@@ -731,7 +810,7 @@ mod tests {
             Material::Print,
         ] {
             let mut rng = ChaCha8Rng::seed_from_u64(9);
-            let texture = paint(material, 0.9, 0.7, 1.0, &mut rng);
+            let texture = paint(material, [0.9, 0.7], 0.005, 1.0, &mut rng);
             let level = &texture.levels[0];
             let n = level.texels.len() as f32;
             let values = || level.texels.iter().map(|t| f32::from(t[1]));

@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 
 use super::motion::BodyState;
 use super::spline::{Smoothing, Spline};
-use crate::dataset::TruthPose;
 use crate::inertial::Stamp;
+use crate::odometry::TruthPose;
 
 /// A recorded trajectory to move along instead of a built-in motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,8 +21,8 @@ pub struct TrajectoryConfig {
     pub file: PathBuf,
     /// Whose poses they are: `"imu"` or `"camera"`.
     pub of: Carrier,
-    /// The direction in the file's world that points up; zeros: found from the turns, which are
-    /// mostly about the vertical, and from the camera being held upright.
+    /// The direction in the file's world that points up; zeros: found from the camera being
+    /// held upright and turned mostly about the vertical, to a few degrees.
     pub up: [f64; 3],
     /// Start within the file, s after its first pose.
     pub start: f64,
@@ -232,21 +232,26 @@ fn leveled(
     poses.iter().map(move_pose).collect()
 }
 
-/// The axis about which the sensor turned most, with the sign that has the camera upright.
+/// The direction to which the rows of the image stay perpendicular and about which the sensor
+/// turns most, with the sign that has the camera upright.
 fn guessed_up(poses: &[TruthPose], body_from_camera: &Isometry3<f64>) -> Vector3<f64> {
     // Steps of a tenth of a second or so: longer than the noise, shorter than a turn.
     const STRIDE: usize = 12;
-    let mut spread = Matrix3::zeros();
+    let right = body_from_camera.rotation * Vector3::x();
+    let down = body_from_camera.rotation * Vector3::y();
+    let (mut level, mut turns) = (Matrix3::zeros(), Matrix3::zeros());
     let mut upright = Vector3::zeros();
-    let body_up = body_from_camera.rotation * -Vector3::y();
     for (before, after) in poses.iter().zip(poses.iter().skip(STRIDE)) {
-        let turn = after.world_from_body.rotation * before.world_from_body.rotation.inverse();
-        let axis = turn.scaled_axis();
-        spread += axis * axis.transpose();
-        upright += before.world_from_body.rotation * body_up;
+        let (before, after) = (before.world_from_body.rotation, after.world_from_body.rotation);
+        let row = before * right;
+        level += row * row.transpose();
+        let turn = (after * before.inverse()).scaled_axis();
+        turns += turn * turn.transpose();
+        upright -= before * down;
     }
-    let eigen = SymmetricEigen::new(spread);
-    let axis = eigen.eigenvectors.column(eigen.eigenvalues.imax()).into_owned();
+    let share = |m: Matrix3<f64>| m / m.trace().max(f64::MIN_POSITIVE);
+    let eigen = SymmetricEigen::new(share(level) - share(turns));
+    let axis = eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned();
     if axis.dot(&upright) < 0.0 { -axis } else { axis }
 }
 
@@ -266,5 +271,73 @@ mod tests {
         for bad in ["1 2 3", "1 2 3 4 0 0 0 0", "x 1 2 3 0 0 0 1", "1 nan 2 3 0 0 0 1"] {
             assert!(pose(bad).is_none(), "{bad}");
         }
+    }
+
+    fn mount() -> Isometry3<f64> {
+        super::super::SceneConfig::default().camera.imu_from_camera().unwrap()
+    }
+
+    /// A recording of the VCU-RVI benchmark, where the development data is at hand.
+    fn recording(name: &str) -> Option<PathBuf> {
+        let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+        let data = std::env::var_os("MFG_VIO_DATA").map_or(beside, PathBuf::from);
+        let file = data.join("vcu_rvi/ground_truths").join(name);
+        if !file.is_file() {
+            eprintln!("SKIPPED: {} is not there (set MFG_VIO_DATA)", file.display());
+            return None;
+        }
+        Some(file)
+    }
+
+    #[test]
+    fn the_vertical_of_a_recording_is_found() {
+        // From the gravity-aligned estimates of visual-inertial systems, or the plane of motion.
+        for (name, up) in [
+            ("lab_simple1_gt.csv", [0.985, 0.05, 0.16]),
+            ("lab_simple3_gt.csv", [0.9775, 0.0488, 0.2004]),
+            ("lab_bumper2_gt.csv", [0.9997, 0.0131, 0.0121]),
+        ] {
+            let Some(file) = recording(name) else { continue };
+            let guess = guessed_up(&read(&file).unwrap(), &mount());
+            let angle = guess.angle(&Vector3::from(up)).to_degrees();
+            assert!(angle < 3.0, "{name}: {angle} deg");
+        }
+    }
+
+    #[test]
+    fn the_curve_stays_with_the_recording() {
+        let Some(file) = recording("lab_bumper1_gt.csv") else { return };
+        let config = TrajectoryConfig { file, start: 5.0, ..TrajectoryConfig::default() };
+        let poses = read(&config.file).unwrap();
+        let poses = leveled(&config, uninterrupted(&config, &poses).unwrap(), &mount());
+        let curve = Trajectory::fit(&poses, config.cutoff).unwrap();
+        let first = poses[0].stamp;
+        let mut offsets: Vec<f64> = Vec::new();
+        for pose in &poses {
+            let tau = pose.stamp.seconds_since(first) - curve.margin;
+            if (0.0..curve.duration()).contains(&tau) {
+                let fitted = curve.state(tau, 1.0, 0.0).world_from_body;
+                assert!(fitted.rotation.angle_to(&pose.world_from_body.rotation) < 0.05);
+                let offset = fitted.translation.vector - pose.world_from_body.translation.vector;
+                offsets.push(offset.norm());
+            }
+        }
+        offsets.sort_by(f64::total_cmp);
+        assert!(offsets.len() > 500 && offsets[offsets.len() / 2] < 1e-3, "{}", offsets.len());
+    }
+
+    #[test]
+    fn gaps_end_a_trajectory() {
+        let pose = |t: f64| TruthPose {
+            stamp: Stamp::default().offset_by(t),
+            world_from_body: Isometry3::identity(),
+        };
+        let poses: Vec<TruthPose> =
+            (0..400).map(|k| pose(0.01 * f64::from(k) + if k < 250 { 0.0 } else { 1.0 })).collect();
+        let config = TrajectoryConfig::default();
+        assert_eq!(uninterrupted(&config, &poses).unwrap().len(), 250);
+        let config = TrajectoryConfig { start: 2.0, ..config };
+        let error = uninterrupted(&config, &poses).unwrap_err();
+        assert!(matches!(error, TrajectoryError::TooShort { usable, .. } if usable < 0.6));
     }
 }

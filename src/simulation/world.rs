@@ -19,13 +19,16 @@ pub struct RoomConfig {
     pub clutter: usize,
     /// Texture of the surfaces, from 0 (bare) to 1 (busy).
     pub richness: f64,
+    /// Edge of a texel of the large surfaces, m; small ones have up to twice the resolution.
+    /// Memory grows with its inverse square.
+    pub texel: f64,
     /// Free space kept around the path, m.
     pub clearance: f64,
 }
 
 impl Default for RoomConfig {
     fn default() -> Self {
-        Self { size: [7.0, 6.0, 2.8], clutter: 26, richness: 0.8, clearance: 0.7 }
+        Self { size: [7.0, 6.0, 2.8], clutter: 26, richness: 0.8, texel: 0.005, clearance: 0.7 }
     }
 }
 
@@ -45,8 +48,11 @@ impl Default for PeopleConfig {
     }
 }
 
+/// Width of the lens's and the color filter's blur spot, pixels.
+const SPOT: f32 = 1.5;
+
 /// Cells of baked light, m.
-const LIGHT_CELL: f32 = 0.1;
+const LIGHT_CELL: f32 = 0.14;
 
 /// One painted and lit face of a box.
 #[derive(Debug)]
@@ -56,11 +62,13 @@ pub(super) struct Face {
     light: Vec<f32>,
     light_columns: usize,
     light_rows: usize,
-    /// Offset of the fine grain, m.
-    grain: [f32; 2],
+    /// Offset of the fine grain, m, and its contrast.
+    grain_offset: [f32; 2],
+    grain_depth: f32,
 }
 
 impl Face {
+    #[inline]
     fn light_at(&self, u: f32, v: f32) -> f32 {
         let x = (u / LIGHT_CELL - 0.5).clamp(0.0, (self.light_columns - 1) as f32);
         let y = (v / LIGHT_CELL - 0.5).clamp(0.0, (self.light_rows - 1) as f32);
@@ -112,6 +120,7 @@ impl Solid {
     }
 
     /// First surface beyond `near` along `direction` (box coordinates).
+    #[inline]
     fn hit(&self, origin: &Vector3<f32>, direction: &Vector3<f32>, near: f32) -> Option<Hit> {
         let mut entry = (f32::MIN, 0);
         let mut exit = (f32::MAX, 0);
@@ -132,6 +141,7 @@ impl Solid {
         (entry.0 < exit.0 && distance > near).then_some(Hit { distance, face })
     }
 
+    #[inline]
     pub fn hit_in_view(&self, view: &View, x: f32, y: f32, near: f32) -> Option<Hit> {
         let direction = view.axes * Vector3::new(x, y, 1.0);
         self.hit(&view.origin, &direction, near)
@@ -139,6 +149,7 @@ impl Solid {
 
     /// Color of a hit in a view: `x`, `y` are normalized image coordinates, `pixel` the size of a
     /// pixel in them.
+    #[inline]
     pub fn color(
         &self,
         view: &View,
@@ -159,12 +170,16 @@ impl Solid {
             let slide = e[axis] / along;
             [e[u] - direction[u] * slide, e[v] - direction[v] * slide]
         };
-        let (dx, dy) = (edge(0, pixel[0]), edge(1, pixel[1]));
+        let (dx, dy) = (edge(0, SPOT * pixel[0]), edge(1, SPOT * pixel[1]));
         let (s, t) = (point[u] + self.half[u], point[v] + self.half[v]);
         let face = &self.faces[hit.face];
         let base = face.texture.sample(s, t, dx, dy);
-        let grey = grain.sample(s + face.grain[0], t + face.grain[1], dx, dy)[0];
-        let factor = (1.0 + 0.5 * (grey - 128.0) / 128.0) * face.light_at(s, t);
+        let mut factor = face.light_at(s, t);
+        let spread = (dx[0] * dy[1] - dx[1] * dy[0]).abs().sqrt();
+        if spread < Texture::FINE_GRAIN_LIMIT {
+            let grey = grain.trilinear(s + face.grain_offset[0], t + face.grain_offset[1], spread);
+            factor *= 1.0 + face.grain_depth * (grey[0] / 128.0 - 1.0);
+        }
         base.map(|c| c * factor)
     }
 
@@ -269,7 +284,7 @@ impl World {
                 let face = |face: usize| {
                     let mut rng = ChaCha8Rng::seed_from_u64(seed);
                     rng.set_stream((6 * index + face) as u64 + 1);
-                    finished_face(plan, face, room.richness as f32, &bare, &lamps, &mut rng)
+                    finished_face(plan, face, room, &bare, &lamps, &mut rng)
                 };
                 Solid { faces: (0..6).map(face).collect(), ..plan.solid() }
             })
@@ -493,14 +508,15 @@ fn lamps(room: &RoomConfig) -> Vec<Vector3<f32>> {
 fn finished_face(
     plan: &Plan,
     face: usize,
-    richness: f32,
+    room: &RoomConfig,
     scene: &[Solid],
     lamps: &[Vector3<f32>],
     rng: &mut ChaCha8Rng,
 ) -> Face {
     let (axis, u, v) = face_axes(face);
     let (width, height) = (plan.size[u] as f32, plan.size[v] as f32);
-    let texture = paint(plan.material(face), width, height, richness, rng);
+    let (texel, richness) = (room.texel as f32, room.richness as f32);
+    let texture = paint(plan.material(face), [width, height], texel, richness, rng);
     let solid = plan.solid();
     let outward = if face % 2 == 1 { 1.0 } else { -1.0 };
     let sign = if plan.inside_out { -outward } else { outward };
@@ -521,7 +537,14 @@ fn finished_face(
                 .push(received_light(&(world + normal * 0.004), &normal, scene, lamps, rng).sqrt());
         }
     }
-    Face { texture, light, light_columns, light_rows, grain: [rng.random(), rng.random()] }
+    Face {
+        texture,
+        light,
+        light_columns,
+        light_rows,
+        grain_offset: [rng.random(), rng.random()],
+        grain_depth: plan.material(face).grain_depth(),
+    }
 }
 
 /// Direct light of the lamps with soft shadows, plus ambient light where the surroundings are open.
@@ -532,8 +555,8 @@ fn received_light(
     lamps: &[Vector3<f32>],
     rng: &mut ChaCha8Rng,
 ) -> f32 {
-    const LAMP_SAMPLES: usize = 4;
-    const AMBIENT_SAMPLES: usize = 12;
+    const LAMP_SAMPLES: usize = 3;
+    const AMBIENT_SAMPLES: usize = 8;
     let mut direct = 0.0;
     for lamp in lamps {
         for _ in 0..LAMP_SAMPLES {
@@ -555,7 +578,7 @@ fn received_light(
             open += 1.0 / AMBIENT_SAMPLES as f32;
         }
     }
-    (0.18 + 0.22 * open + 1.6 * direct).min(1.3)
+    (0.1 + 0.2 * open + 2.4 * direct).min(1.6)
 }
 
 fn unit_vector(rng: &mut ChaCha8Rng) -> Vector3<f32> {
@@ -567,7 +590,14 @@ fn unit_vector(rng: &mut ChaCha8Rng) -> Vector3<f32> {
 
 /// Whether a box stands between `point` and `point + ray`; the room itself hides nothing.
 fn occluded(point: &Vector3<f32>, ray: &Vector3<f32>, scene: &[Solid]) -> bool {
-    scene.iter().filter(|solid| !solid.inside_out).any(|solid| {
+    let length = ray.norm();
+    // Most boxes lie far from the ray.
+    let near = |solid: &&Solid| {
+        let offset = solid.world_from_box.translation.vector - point;
+        let along = (offset.dot(ray) / length).clamp(0.0, length);
+        (offset - ray * (along / length)).norm_squared() <= solid.half.norm_squared()
+    };
+    scene.iter().filter(|solid| !solid.inside_out).filter(near).any(|solid| {
         let origin = solid.world_from_box.inverse_transform_point(&(*point).into()).coords;
         let direction = solid.world_from_box.inverse_transform_vector(ray);
         solid.hit(&origin, &direction, 0.0).is_some_and(|hit| hit.distance < 1.0)

@@ -65,7 +65,7 @@ impl Layout {
     fn log(mut self, contents: &Contents) -> RecordingStreamResult<()> {
         let world = self.world()?;
         let camera = self.view::<Spatial2DView>(
-            "Camera: inliers green, outliers red, new blue, unmatched grey, no depth brown",
+            "Camera: inliers green, outliers red, new blue, others grey",
             scene::IMAGE,
             &["+ $origin/**".to_owned(), format!("- {}", scene::DEPTH)],
         )?;

@@ -1,5 +1,6 @@
 use std::io;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use rerun::RecordingStreamError;
 use rerun::sink::SinkFlushError;
@@ -15,6 +16,8 @@ pub enum ViewerError {
     Create { path: PathBuf, source: io::Error },
     #[error("{url:?} is not the address of a Rerun viewer: give rerun+http://HOST:PORT/proxy")]
     Address { url: String },
+    #[error("no Rerun viewer answers at {url} within {} s", patience.as_secs())]
+    Unreachable { url: String, patience: Duration },
     #[error(
         "no `rerun` executable of the viewer found: install version {version} \
          (pip install rerun-sdk=={version}) or record into a file"

@@ -1,28 +1,31 @@
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nalgebra::Isometry3;
 use rerun::external::re_log_encoding::{Decodable as _, StreamFooter};
 use rerun::external::re_uri::RedapUri;
 use rerun::log::ChunkBatcherConfig;
-use rerun::sink::{FileSink, FileSinkError, GrpcSink, LogSink};
+use rerun::sink::{FileSink, FileSinkError, GrpcSink, GrpcSinkConnectionState, LogSink};
 use rerun::{RecordingStream, RecordingStreamBuilder, SpawnError, SpawnOptions};
 
 use super::config::is_due;
 use super::scene::{self, Scene};
 use super::timeline::{Clock, FRAME, TIME};
 use super::{RecordingConfig, ViewerError, blueprint, image, plots};
-use crate::dataset::RgbdFrame;
 use crate::inertial::ImuSample;
 use crate::odometry::StepReport;
-use crate::vision::{ColorImage, DepthImage, PinholeCamera};
+use crate::vision::{ColorImage, DepthImage, PinholeCamera, RgbdFrame};
 
 /// Viewers keep the layout that a user has arranged by the application's name.
 const APPLICATION: &str = "mfg-vio";
 /// How long a viewer may take to receive what is left at the end.
 const VIEWER_TIMEOUT: Duration = Duration::from_secs(10);
+/// How long a viewer that is said to run may take to answer.
+const CONNECT_PATIENCE: Duration = Duration::from_secs(3);
+/// How long a viewer may take to start and answer.
+const SPAWN_PATIENCE: Duration = Duration::from_secs(30);
 
 /// Where a recording goes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -84,7 +87,7 @@ impl Recorder {
     ///
     /// # Errors
     /// If the configuration is out of range, no sink is given, a file cannot be created, an
-    /// address is none of a viewer, or no viewer can be started.
+    /// address is none of a viewer, no viewer answers there, or none can be started.
     pub fn new(
         sinks: &[Sink],
         contents: &Contents,
@@ -96,7 +99,7 @@ impl Recorder {
         }
         let files: Vec<PathBuf> = sinks.iter().filter_map(Sink::file).collect();
         let lossy = files.is_empty();
-        let stream = open(sinks, contents, lossy)?;
+        let stream = open(sinks, contents)?;
         blueprint::send(&stream, APPLICATION, contents)?;
         scene::log_styles(&stream)?;
         plots::log_styles(&stream)?;
@@ -221,8 +224,8 @@ impl Sink {
     fn open(&self) -> Result<Box<dyn LogSink>, ViewerError> {
         match self {
             Self::File(path) => Ok(Box::new(create(path)?)),
-            Self::Connect(url) => connect(url),
-            Self::Spawn => connect(&spawn()?),
+            Self::Connect(url) => connect(url, CONNECT_PATIENCE),
+            Self::Spawn => connect(&spawn()?, SPAWN_PATIENCE),
         }
     }
 }
@@ -235,11 +238,20 @@ fn create(path: &Path) -> Result<FileSink, ViewerError> {
     })
 }
 
-fn connect(url: &str) -> Result<Box<dyn LogSink>, ViewerError> {
-    match url.parse() {
-        Ok(RedapUri::Proxy(address)) => Ok(Box::new(GrpcSink::new(address))),
-        _ => Err(ViewerError::Address { url: url.to_owned() }),
+/// Waits until the viewer answers: a sink without one would never end.
+fn connect(url: &str, patience: Duration) -> Result<Box<dyn LogSink>, ViewerError> {
+    let Ok(RedapUri::Proxy(address)) = url.parse() else {
+        return Err(ViewerError::Address { url: url.to_owned() });
+    };
+    let sink = GrpcSink::new(address);
+    let begin = Instant::now();
+    while sink.status() != GrpcSinkConnectionState::Connected {
+        if begin.elapsed() > patience {
+            return Err(ViewerError::Unreachable { url: url.to_owned(), patience });
+        }
+        std::thread::sleep(Duration::from_millis(20));
     }
+    Ok(Box::new(sink))
 }
 
 /// Starts a viewer that only this machine can reach; returns its address.
@@ -258,20 +270,19 @@ fn spawn() -> Result<String, ViewerError> {
     Ok(format!("rerun+http://127.0.0.1:{}/proxy", viewer.port))
 }
 
-fn open(sinks: &[Sink], contents: &Contents, live: bool) -> Result<RecordingStream, ViewerError> {
+fn open(sinks: &[Sink], contents: &Contents) -> Result<RecordingStream, ViewerError> {
     let opened: Vec<Box<dyn LogSink>> = sinks.iter().map(Sink::open).collect::<Result<_, _>>()?;
+    let live = sinks.iter().any(|sink| sink.file().is_none());
+    // Few large chunks: each costs a kilobyte and time in the viewer. In files they end by size
+    // rather than by the clock, so that those of the same run are alike.
+    let flush_tick = if live { Duration::from_millis(200) } else { Duration::from_secs(10) };
     let mut builder = RecordingStreamBuilder::new(APPLICATION)
         // Asking for a recording outweighs the environment's `RERUN=off`.
-        .enabled(true);
-    if live {
-        builder = builder.batcher_config(ChunkBatcherConfig::LOW_LATENCY);
-    } else {
-        // Few large chunks: each costs a kilobyte and time in the viewer. That they end by size
-        // rather than by the clock makes files of the same run alike.
-        let flush_tick = Duration::from_secs(10);
-        builder = builder
-            .batcher_config(ChunkBatcherConfig { flush_tick, ..ChunkBatcherConfig::DEFAULT })
-            .recording_id(contents.name.as_str());
+        .enabled(true)
+        .batcher_config(ChunkBatcherConfig { flush_tick, ..ChunkBatcherConfig::DEFAULT });
+    // A running viewer would merge runs of one identity.
+    if !live {
+        builder = builder.recording_id(contents.name.as_str());
     }
     let stream = builder.set_sinks(opened)?;
     stream.set_log_time_enabled(false);

@@ -13,13 +13,11 @@ use rerun::external::re_log_encoding::{Decodable as _, DecoderApp, StreamFooter}
 use rerun::log::{Chunk, LogMsg};
 
 use super::*;
-use crate::dataset::RgbdFrame;
-use crate::inertial::{ImuSample, Stamp};
-use crate::inertial::{NavCovariance, NavState, block};
+use crate::inertial::{ImuSample, NavCovariance, NavState, Stamp, block};
 use crate::odometry::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
-use crate::vision::{ColorImage, DepthImage, PinholeCamera, PixelFormat};
+use crate::vision::{ColorImage, DepthImage, PinholeCamera, PixelFormat, RgbdFrame};
 
 const SIZE: [usize; 2] = [320, 240];
 const CAMERA: PinholeCamera = PinholeCamera { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5 };
@@ -211,8 +209,12 @@ pub(super) fn frame(frame: u64) -> (StepReport, RgbdFrame) {
 }
 
 fn record(path: &Path, frames: u64, config: &RecordingConfig) -> Result<(), ViewerError> {
+    record_into(Sink::File(path.to_owned()), frames, config)
+}
+
+fn record_into(sink: Sink, frames: u64, config: &RecordingConfig) -> Result<(), ViewerError> {
     let contents = Contents { name: "walk".to_owned(), truth: true, imu: true };
-    let mut recorder = Recorder::new(&[Sink::File(path.to_owned())], &contents, config)?;
+    let mut recorder = Recorder::new(&[sink], &contents, config)?;
     recorder.camera(&CAMERA, &Walk::imu_from_camera(), SIZE);
     let mut walk = Walk::new();
     let mut samples = 0;
@@ -351,14 +353,24 @@ fn sinks_that_cannot_be_opened_are_named() {
     assert!(file.starts_with("/nonexistent/run.rrd: cannot be created"), "{file}");
     let address = error(&[Sink::Connect("localhost:9876".to_owned())]);
     assert!(address.contains("\"localhost:9876\""), "{address}");
+    // Nothing listens on the discard port.
+    let silent = "rerun+http://127.0.0.1:9/proxy".to_owned();
+    let unreachable = error(&[Sink::Connect(silent)]);
+    assert!(unreachable.contains("127.0.0.1:9/proxy within"), "{unreachable}");
     error(&[]);
 }
 
-/// `MFG_VIO_RRD=walk.rrd [MFG_VIO_FRAMES=9000] cargo test --lib viewer -- --ignored`, then open it.
+/// `MFG_VIO_RRD=walk.rrd [MFG_VIO_FRAMES=9000] cargo test --lib viewer -- --ignored`, then open it;
+/// or `MFG_VIO_RRD=rerun+http://127.0.0.1:9876/proxy` for a viewer that is open.
 #[test]
 #[ignore = "writes a recording to look at"]
 fn write_a_recording_to_look_at() {
-    let path = std::env::var("MFG_VIO_RRD").unwrap();
+    let target = std::env::var("MFG_VIO_RRD").unwrap();
     let frames = std::env::var("MFG_VIO_FRAMES").map_or(600, |frames| frames.parse().unwrap());
-    record(Path::new(&path), frames, &RecordingConfig::default()).unwrap();
+    let sink = if target.starts_with("rerun+") {
+        Sink::Connect(target)
+    } else {
+        Sink::File(target.into())
+    };
+    record_into(sink, frames, &RecordingConfig::default()).unwrap();
 }

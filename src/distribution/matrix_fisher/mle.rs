@@ -56,7 +56,14 @@ pub fn s_from_d(d: &Vector3<f64>) -> Result<Vector3<f64>, MomentError> {
 
 /// `S` with `1 - E[Q_ii] = g_i`, for `g1 <= g2 <= min(g3, 2 - g3)`.
 pub fn s_from_complement(g: &Vector3<f64>) -> Result<Vector3<f64>, MomentError> {
-    let squares = [g[1] + g[2] - g[0], g[0] + g[2] - g[1], g[0] + g[1] - g[2]].map(|m| 0.25 * m);
+    let target = squares_of_complement(g)?;
+    solve(&target, initial_sums(&target))
+        .map(|sums| sums.singular_values())
+        .map_err(|error| error.with_moments(g.map(|g| 1.0 - g).into()))
+}
+
+/// `E[x_i^2]` from `1 - d`, checked.
+fn squares_of_complement(g: &Vector3<f64>) -> Result<[f64; 3], MomentError> {
     let d = g.map(|g| 1.0 - g);
     if !g.iter().all(|x| x.is_finite()) {
         return Err(MomentError::NotFinite(d.into()));
@@ -65,28 +72,53 @@ pub fn s_from_complement(g: &Vector3<f64>) -> Result<Vector3<f64>, MomentError> 
     if !(g[0] <= g[1] + TIE && g[1] <= g[2] + TIE && g[1] + g[2] <= 2.0 + TIE) {
         return Err(MomentError::NotOrdered(d.into()));
     }
-    s_from_squares(&squares).map_err(|error| error.with_moments(d.into()))
+    let squares = [g[1] + g[2] - g[0], g[0] + g[2] - g[1], g[0] + g[1] - g[2]].map(|m| 0.25 * m);
+    if !squares.iter().all(|&m| m > 0.0) {
+        return Err(MomentError::NotAdmissible(d.into()));
+    }
+    Ok(squares)
 }
 
 impl MomentError {
     fn with_moments(self, d: [f64; 3]) -> Self {
         match self {
             Self::NotConverged { step, .. } => Self::NotConverged { moments: d, step },
-            Self::NotFinite(_) => Self::NotFinite(d),
-            Self::NotOrdered(_) => Self::NotOrdered(d),
-            Self::NotAdmissible(_) => Self::NotAdmissible(d),
+            other => other,
         }
     }
 }
 
-/// `S` from `E[x_i^2]`, `i = 1, 2, 3`, in descending order and none above `E[x_0^2]`.
-pub(in crate::distribution) fn s_from_squares(
-    target: &[f64; 3],
-) -> Result<Vector3<f64>, MomentError> {
-    if target.iter().any(|&m| !(m > 0.0)) {
-        return Err(MomentError::NotAdmissible(*target));
+/// `S` from `E[x_i^2]`, `i = 1, 2, 3`, of the unit quaternion of `Q`: in descending order and
+/// none above `E[x_0^2]`. The best conditioned form of the problem: each moment may be accurate
+/// in relative terms.
+pub fn s_from_quaternion_squares(squares: &Vector3<f64>) -> Result<Vector3<f64>, MomentError> {
+    let target: [f64; 3] = (*squares).into();
+    if !target.iter().all(|m| m.is_finite()) {
+        return Err(MomentError::NotFinite(target));
     }
-    solve(target, initial_sums(target)).map(|sums| sums.singular_values())
+    let scalar = 1.0 - squares.sum();
+    let ordered = target[0] <= scalar + TIE && target.is_sorted_by(|a, b| *b <= a + TIE);
+    if !ordered {
+        return Err(MomentError::NotOrdered(target));
+    }
+    if !target.iter().all(|&m| m > 0.0) {
+        return Err(MomentError::NotAdmissible(target));
+    }
+    solve(&target, initial_sums(&target)).map(|sums| sums.singular_values())
+}
+
+/// [`s_from_complement`] started from a neighbouring solution, as a filter has it from its last
+/// step; falls back to the cold start where that fails.
+pub fn s_from_complement_near(
+    g: &Vector3<f64>,
+    neighbour: &Vector3<f64>,
+) -> Result<Vector3<f64>, MomentError> {
+    let target = squares_of_complement(g)?;
+    let start = Sums::of_singular_values(neighbour).a.map(|a| a.max(0.0));
+    solve(&target, ordered(start))
+        .or_else(|_| solve(&target, initial_sums(&target)))
+        .map(|sums| sums.singular_values())
+        .map_err(|error| error.with_moments(g.map(|g| 1.0 - g).into()))
 }
 
 /// A guess that is exact to leading order at the uniform and at the concentrated end of each

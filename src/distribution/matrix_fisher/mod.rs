@@ -19,14 +19,18 @@
 //! `s3`, repetitions and opposites included, the largest relative errors are stated at
 //! [`Moments`].
 
+mod approximation;
+mod axes;
 mod concentrated;
 mod engine;
 mod forms;
+mod information;
 mod mle;
 mod moments;
 mod near_uniform;
 mod quadrature;
 mod sampler;
+mod subset;
 
 use nalgebra::{Matrix3, Rotation3, SMatrix, SymmetricEigen, Vector3};
 use rand::Rng;
@@ -35,9 +39,14 @@ use rand_distr::Distribution;
 use crate::so3::{NotFinite, ProperSvd, proper_svd, quaternion_from_rotation};
 use engine::Sums;
 
-pub use mle::{MomentError, s_from_complement, s_from_d};
+pub use approximation::{ApproximateMoments, s_concentrated, s_near_uniform};
+pub use axes::canonical_axes;
+pub use mle::{
+    MomentError, s_from_complement, s_from_complement_near, s_from_d, s_from_quaternion_squares,
+};
 pub use moments::Moments;
 pub use sampler::MatrixFisherSampler;
+pub use subset::SubsetConcentration;
 
 /// Largest singular value; beyond it products of concentrations overflow.
 const MAX_SINGULAR_VALUE: f64 = 1e100;
@@ -235,6 +244,11 @@ fn ascending_eigenvectors(symmetric: &Matrix3<f64>) -> (Rotation3<f64>, [f64; 3]
     let [x, y] = [order[0], order[1]].map(|i| eigen.eigenvectors.column(i).into_owned());
     let axes = Matrix3::from_columns(&[x, y, x.cross(&y)]);
     (Rotation3::from_matrix_unchecked(axes), order.map(|i| eigen.eigenvalues[i]))
+}
+
+/// `s2 + s3, s1 + s3, s1 + s2`: the concentrations about the principal axes.
+pub(super) fn sums_of_singular_values(s: &Vector3<f64>) -> [f64; 3] {
+    Sums::of_singular_values(s).a
 }
 
 fn check_singular_values(s: &Vector3<f64>) -> Result<(), InvalidSingularValues> {

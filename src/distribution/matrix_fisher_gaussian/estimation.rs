@@ -1,0 +1,179 @@
+//! Estimates of matrix Fisher-Gaussian parameters: from samples, from moments, from a Gaussian.
+
+use nalgebra::allocator::Allocator;
+use nalgebra::{DefaultAllocator, Dim, Matrix3, OMatrix, OVector, Rotation3, U1, U3, Vector3};
+
+use super::{
+    Correlation, MatrixFisherGaussian, MfgError, scale_columns, symmetric, tangent_information,
+};
+use crate::distribution::matrix_fisher::MatrixFisher;
+use crate::so3::{ProperSvd, proper_svd};
+
+/// Moments that determine the conditional part once the attitude's distribution is known
+/// (3.24-3.26).
+#[derive(Debug, Clone)]
+pub struct ConditionalMoments<D: Dim>
+where
+    DefaultAllocator: Allocator<D> + Allocator<D, D> + Allocator<D, U3>,
+{
+    /// `E[x]`.
+    pub mean: OVector<f64, D>,
+    /// `E[v_R]`.
+    pub deviation_mean: Vector3<f64>,
+    /// `Cov[x]`.
+    pub covariance: OMatrix<f64, D, D>,
+    /// `Cov[x, v_R]`.
+    pub cross: OMatrix<f64, D, U3>,
+    /// `Cov[v_R]`.
+    pub deviation_covariance: Matrix3<f64>,
+}
+
+/// A sample of the attitude and the vector with its weight.
+#[derive(Debug, Clone)]
+pub struct WeightedSample<D: Dim>
+where
+    DefaultAllocator: Allocator<D>,
+{
+    pub weight: f64,
+    pub attitude: Rotation3<f64>,
+    pub x: OVector<f64, D>,
+}
+
+impl<D: Dim> MatrixFisherGaussian<D>
+where
+    DefaultAllocator:
+        Allocator<D> + Allocator<D, D> + Allocator<D, U3> + Allocator<U3, D> + Allocator<U1, D>,
+{
+    /// The conditional MLE (theorem 3.6) for a given attitude distribution; `v_R` of the moments
+    /// must be that of `attitude` and `correlation`.
+    ///
+    /// Directions of `v_R` without variance, those of an attitude distribution that does not
+    /// depend on them, get no correlation.
+    pub fn from_moments(
+        attitude: MatrixFisher,
+        correlation: Correlation,
+        moments: &ConditionalMoments<D>,
+    ) -> Result<Self, MfgError> {
+        let p = regress(&moments.cross, &moments.deviation_covariance)?;
+        let mu = &moments.mean - &p * moments.deviation_mean;
+        let conditional = &moments.covariance - &p * moments.cross.transpose();
+        Self::from_conditional(attitude, mu, symmetric(conditional), p, correlation)
+    }
+
+    /// The marginal-conditional MLE from weighted samples: the attitude from their mean `E[R]`,
+    /// then theorem 3.6.
+    pub fn from_samples(
+        samples: &[WeightedSample<D>],
+        correlation: Correlation,
+    ) -> Result<Self, MfgError> {
+        let total: f64 = samples.iter().map(|s| s.weight).sum();
+        let first = samples.first().filter(|_| total > 0.0).ok_or(MfgError::NoSamples)?;
+        let mean =
+            |r: Matrix3<f64>, s: &WeightedSample<D>| r + s.attitude.matrix() * (s.weight / total);
+        let attitude = MatrixFisher::from_mean(&samples.iter().fold(Matrix3::zeros(), mean))?;
+        let deviation = |s: &WeightedSample<D>| {
+            correlation.deviation(&attitude.centred(&s.attitude), &attitude.svd().s)
+        };
+
+        let mut moments = ConditionalMoments {
+            mean: &first.x * 0.0,
+            deviation_mean: Vector3::zeros(),
+            covariance: &first.x * first.x.transpose() * 0.0,
+            cross: &first.x * Vector3::zeros().transpose(),
+            deviation_covariance: Matrix3::zeros(),
+        };
+        for sample in samples {
+            let weight = sample.weight / total;
+            moments.mean += &sample.x * weight;
+            moments.deviation_mean += deviation(sample) * weight;
+        }
+        for sample in samples {
+            let weight = sample.weight / total;
+            let x = &sample.x - &moments.mean;
+            let v = deviation(sample) - moments.deviation_mean;
+            moments.covariance += &x * x.transpose() * weight;
+            moments.cross += &x * v.transpose() * weight;
+            moments.deviation_covariance += v * v.transpose() * weight;
+        }
+        Self::from_moments(attitude, correlation, &moments)
+    }
+
+    /// The distribution that a concentrated Gaussian of `x` and the body-frame rotation vector
+    /// `e` of `mode exp(e^)` approximates (theorem 3.4 read backwards): `cross = Cov[x, e]`.
+    pub fn from_gaussian(
+        mode: Rotation3<f64>,
+        mu: OVector<f64, D>,
+        sigma: OMatrix<f64, D, D>,
+        cross: &OMatrix<f64, D, U3>,
+        rotation: &Matrix3<f64>,
+        correlation: Correlation,
+    ) -> Result<Self, MfgError> {
+        let inverse = rotation.cholesky().ok_or(MfgError::RotationCovariance)?.inverse();
+        let attitude = MatrixFisher::from_mode_and_information(mode, inverse)?;
+        let p = cross * attitude.svd().v.matrix();
+        Self::new(attitude, mu, sigma, p, correlation)
+    }
+
+    /// The Gaussian of `x` and the body-frame rotation vector that approximates a concentrated
+    /// distribution (3.15): `Cov[x]`, `Cov[x, e]` and `Cov[e]`.
+    ///
+    /// `None` unless the attitude is concentrated about all axes, `s2 + s3 > 0`.
+    pub fn to_gaussian(&self) -> Option<(OMatrix<f64, D, D>, OMatrix<f64, D, U3>, Matrix3<f64>)> {
+        let v = self.attitude().svd().v;
+        let rotation = self.attitude().information().cholesky()?.inverse();
+        Some((self.sigma(), self.p() * v.matrix().transpose(), rotation))
+    }
+
+    /// The moments of the conditional part that [`from_moments`](Self::from_moments) inverts.
+    pub fn conditional_moments(&self) -> ConditionalMoments<D> {
+        let moments = self.moments();
+        ConditionalMoments {
+            mean: moments.mean,
+            deviation_mean: Vector3::zeros(),
+            covariance: moments.covariance,
+            cross: moments.cross,
+            deviation_covariance: diagonal(&moments.deviation),
+        }
+    }
+
+    /// Diagonal of `tr(S) I - S`: the inverse covariance of the rotation vector in principal
+    /// axes.
+    pub fn tangent_information(&self) -> Vector3<f64> {
+        tangent_information(self.attitude())
+    }
+}
+
+fn diagonal(v: &Vector3<f64>) -> Matrix3<f64> {
+    Matrix3::from_diagonal(v)
+}
+
+/// Singular values of a correlation matrix below this count as zero.
+const SINGULAR: f64 = 1e-12;
+
+/// `cross covariance^-1`, with the covariance scaled to unit diagonal: its entries may differ by
+/// the square of the ratio of concentrations.
+fn regress<D: Dim>(
+    cross: &OMatrix<f64, D, U3>,
+    covariance: &Matrix3<f64>,
+) -> Result<OMatrix<f64, D, U3>, MfgError>
+where
+    DefaultAllocator: Allocator<D, U3>,
+{
+    let scale = inverse_deviations(covariance);
+    let inverse = correlation_inverse(covariance, &diagonal(&scale))?;
+    Ok(scale_columns(&(scale_columns(cross, &scale) * inverse), &scale))
+}
+
+fn inverse_deviations(covariance: &Matrix3<f64>) -> Vector3<f64> {
+    covariance.diagonal().map(|v| if v > 0.0 { v.sqrt().recip() } else { 0.0 })
+}
+
+fn correlation_inverse(
+    covariance: &Matrix3<f64>,
+    scaling: &Matrix3<f64>,
+) -> Result<Matrix3<f64>, MfgError> {
+    let svd = proper_svd(&(scaling * covariance * scaling))
+        .map_err(|_| MfgError::NotFinite("Cov[v_R]"))?;
+    let inverse = svd.s.map(|s| if s.abs() > SINGULAR { s.recip() } else { 0.0 });
+    Ok(ProperSvd { u: svd.v, s: inverse, v: svd.u }.matrix())
+}
