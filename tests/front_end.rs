@@ -243,33 +243,6 @@ fn run(sequence: &Sequence, config: &FeatureConfig) -> Summary {
         s.guided_ms.push(start.elapsed().as_secs_f64() * 1e3);
         let pairs = correspondences(&world, &now, &matches);
         let data: Vec<_> = pairs.iter().map(|p| p.1).collect();
-        s.all_matches.push(data.len() as f64);
-        let start = Instant::now();
-        let found = estimate_pose(&data, &camera, None, &ransac, index as u64);
-        s.ransac_ms.push(start.elapsed().as_secs_f64() * 1e3);
-        s.all_inliers.push(found.map_or(0.0, |f| f.inliers.len() as f64));
-
-        // As with an IMU: the rotation known, the translation zero.
-        let predicted = Isometry3::from_parts(Translation3::identity(), truth.rotation);
-        let prediction = |f: &Feature| {
-            let point = f.measurement.map_or(camera.unproject(f.pixel, 2.0), |m| m.point);
-            let pixel = camera.project(&predicted.inverse_transform_point(&point.into()).coords);
-            Prediction { descriptor: f.descriptor, pixel: pixel.unwrap_or_default(), radius: 20.0 }
-        };
-        let start = Instant::now();
-        let predictions: Vec<_> = world.iter().map(prediction).collect();
-        let matches = match_guided(&predictions, &now, &matching);
-        s.guided_ms.push(start.elapsed().as_secs_f64() * 1e3);
-        if follow {
-            let link = |m: &Match| Link { feature: m.train, previous: world[m.query].pixel };
-            let links: Vec<_> = matches.iter().map(link).collect();
-            let start = Instant::now();
-            let moved = extractor.follow(frame, &mut now, &links).unwrap();
-            s.follow_ms.push(start.elapsed().as_secs_f64() * 1e3);
-            s.followed.push(moved.iter().filter(|&&m| m).count() as f64 / links.len() as f64);
-        }
-        let pairs = correspondences(&world, &now, &matches);
-        let data: Vec<_> = pairs.iter().map(|p| p.1).collect();
         s.guided_matches.push(data.len() as f64);
         let found = estimate_pose(&data, &camera, Some(&truth.rotation), &ransac, index as u64);
         let Some(found) = found else {
