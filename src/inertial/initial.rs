@@ -22,9 +22,9 @@ impl Default for StandstillConfig {
     fn default() -> Self {
         Self {
             window: 0.5,
-            max_gyro_deviation: 0.02,
-            max_accel_deviation: 0.15,
-            max_gyro_mean: 0.1,
+            max_gyro_deviation: 0.015,
+            max_accel_deviation: 0.1,
+            max_gyro_mean: 0.05,
         }
     }
 }

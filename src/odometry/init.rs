@@ -189,8 +189,14 @@ impl Initializer {
             let start = imu.partition_point(|s| s.stamp < first);
             imu.get(start..end).unwrap_or_default()
         };
-        if !covered(self.standstill.window) && !evidence.ended {
-            return Attempt::Wait;
+        if !covered(self.standstill.window) {
+            return match evidence.ended {
+                false => Attempt::Wait,
+                true => Attempt::NextFrame(format!(
+                    "the IMU data end within {} s of this frame",
+                    self.standstill.window
+                )),
+            };
         }
         let Some(check) = StandstillCheck::measure(window(self.standstill.window)) else {
             return Attempt::NextFrame("no IMU samples after this frame".to_owned());

@@ -203,10 +203,11 @@ impl Odometry {
         match self.initializer.attempt(&evidence) {
             Attempt::Wait => None,
             Attempt::NextFrame(reason) => {
-                if self.waiting_reason.is_none() {
+                // The first reason tells most: later ones may only say that the log has ended.
+                self.waiting_reason.get_or_insert_with(|| {
                     tracing::warn!("not initialised at {first_frame} s: {reason}; waiting");
-                }
-                self.waiting_reason = Some(reason);
+                    reason
+                });
                 self.frames.pop_front();
                 self.stats.frames_before_initialization += 1;
                 Some(None)

@@ -29,8 +29,8 @@ const BLOCK: usize = 64;
 const FAST_MARGIN: usize = 4;
 /// A block with fewer corners than this is searched again with the lower threshold.
 const FEW_IN_BLOCK: usize = 8;
-/// Most corners taken from a block of one level: several times its share of the features.
-const MOST_IN_BLOCK: i32 = 16;
+/// Corners taken from a block of one level, at most, as a multiple of its share of the features.
+const SHARE_OF_BLOCK: usize = 2;
 
 /// A corner within a block: column, row and FAST score.
 struct BlockCorner {
@@ -165,11 +165,13 @@ impl OrbExtractor {
         if columns <= 2 * BORDER || rows <= 2 * BORDER {
             return Ok(());
         }
+        let in_full_image = width.div_ceil(BLOCK) * height.div_ceil(BLOCK);
+        let most = SHARE_OF_BLOCK * self.config.max_features.div_ceil(in_full_image);
         let scale = Vector2::new(width as f64 / columns as f64, height as f64 / rows as f64);
         for (left, across) in blocks(columns) {
             for (top, down) in blocks(rows) {
                 let block = Rect::new(left as i32, top as i32, across as i32, down as i32);
-                for point in self.detect_in(&image.roi(block)?)? {
+                for point in self.detect_in(&image.roi(block)?, most)? {
                     let (column, row) = (left + point.x, top + point.y);
                     corners.push(Corner {
                         pixel: full_pixel(Point2::new(column as f64, row as f64), scale),
@@ -185,7 +187,11 @@ impl OrbExtractor {
     }
 
     /// The strongest corners of a block, with the lower threshold where the higher one finds few.
-    fn detect_in(&mut self, block: &BoxedRef<Mat>) -> Result<Vec<BlockCorner>, VisionError> {
+    fn detect_in(
+        &mut self,
+        block: &BoxedRef<Mat>,
+        most: usize,
+    ) -> Result<Vec<BlockCorner>, VisionError> {
         let mut found = Vector::<KeyPoint>::new();
         self.fast.detect_def(block, &mut found)?;
         if found.len() < FEW_IN_BLOCK {
@@ -193,7 +199,7 @@ impl OrbExtractor {
         }
         // Before the points cross over from OpenCV one by one.
         KeyPointsFilter::run_by_image_border(&mut found, block.size()?, FAST_MARGIN as i32)?;
-        KeyPointsFilter::retain_best(&mut found, MOST_IN_BLOCK)?;
+        KeyPointsFilter::retain_best(&mut found, most.try_into().unwrap_or(i32::MAX))?;
         let corner = |point: KeyPoint| BlockCorner {
             x: point.pt().x as usize,
             y: point.pt().y as usize,
