@@ -1,17 +1,18 @@
 //! `mfg-vio evaluate`: trajectory error, consistency and comparison of runs.
 
+use std::collections::BTreeSet;
 use std::io::Write;
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand, ValueEnum};
-use mfg_vio::evaluation::report::{Report, write_html};
 use mfg_vio::evaluation::{
-    self, Alignment, ApeOptions, AssociationOptions, Cell, Delta, Figure, NeesOptions, NeesSummary,
-    Relation, RpeOptions, Similarity, Statistics, SubTrajectoryError, Table, TrajectoryFile,
-    TrajectoryFormat,
+    self, Alignment, ApeOptions, AssociationOptions, Cell, Delta, EvaluationError, Figure,
+    NeesOptions, NeesSummary, Relation, Report, RpeOptions, Similarity, Statistics,
+    SubTrajectoryError, Table, TrajectoryFile, TrajectoryFormat, write_html,
 };
+use rayon::prelude::*;
 use serde::Serialize;
 
 #[derive(Debug, Args)]
@@ -256,6 +257,11 @@ fn time_offset(text: &str) -> Result<TimeOffset, String> {
     if text == "auto" { Ok(TimeOffset::Auto) } else { finite(text).map(TimeOffset::Fixed) }
 }
 
+/// Ends the program as clap does for what it can tell by itself.
+fn wrong_usage(message: String) -> ! {
+    clap::Error::raw(clap::error::ErrorKind::ValueValidation, message + "\n").exit()
+}
+
 fn finite(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
@@ -352,19 +358,19 @@ struct Presentation {
 fn ape(args: &ApeArgs) -> anyhow::Result<()> {
     let inputs = &args.inputs;
     let alignment = Alignment::from(args.align);
-    let reference = read(&inputs.reference)?;
+    let (reference, estimates) = inputs.read()?;
     let mut reports = Vec::new();
     let mut figures = Vec::new();
     let mut groups = Vec::new();
-    for path in &inputs.estimates {
-        let estimate = read_beside(path, &reference)?;
+    let mut names = short_names(&inputs.estimates).into_iter();
+    for (path, estimate) in inputs.estimates.iter().zip(&estimates) {
         let options = ApeOptions {
-            association: inputs.matching.association(path, &reference, &estimate)?,
+            association: inputs.matching.association(path, &reference, estimate)?,
             alignment,
             align_n: inputs.matching.align_n.map(NonZeroUsize::get),
             relation: inputs.relation.into(),
         };
-        let (file, name) = (path.display().to_string(), name_of(path));
+        let (file, name) = (path.display().to_string(), names.next().unwrap_or_default());
         let (reference, estimate) = (&reference.trajectory, &estimate.trajectory);
         let pairs = evaluation::associate(reference, estimate, &options.association)
             .with_context(|| file.clone())?;
@@ -414,26 +420,27 @@ fn rpe(args: &RpeArgs) -> anyhow::Result<()> {
     let inputs = &args.inputs;
     let delta = match args.unit {
         UnitArg::F if args.delta.fract() == 0.0 => Delta::Frames(args.delta as usize),
-        UnitArg::F => bail!("--delta {}: a number of frames must be whole", args.delta),
+        UnitArg::F => wrong_usage(format!("--delta {}: a number of frames is whole", args.delta)),
         UnitArg::S => Delta::Seconds(args.delta),
         UnitArg::M => Delta::Metres(args.delta),
-        UnitArg::Deg => Delta::Degrees(args.delta),
+        UnitArg::Deg if args.delta <= 180.0 => Delta::Degrees(args.delta),
+        UnitArg::Deg => wrong_usage(format!("--delta {}: an angle is at most 180", args.delta)),
     };
-    let reference = read(&inputs.reference)?;
+    let (reference, estimates) = inputs.read()?;
     let mut reports = Vec::new();
     let mut figures = Vec::new();
     let mut groups = Vec::new();
-    for path in &inputs.estimates {
-        let estimate = read_beside(path, &reference)?;
+    let mut names = short_names(&inputs.estimates).into_iter();
+    for (path, estimate) in inputs.estimates.iter().zip(&estimates) {
         let options = RpeOptions {
-            association: inputs.matching.association(path, &reference, &estimate)?,
+            association: inputs.matching.association(path, &reference, estimate)?,
             alignment: args.align.into(),
             align_n: inputs.matching.align_n.map(NonZeroUsize::get),
             relation: inputs.relation.into(),
             delta,
             all_pairs: args.all_pairs,
         };
-        let (file, name) = (path.display().to_string(), name_of(path));
+        let (file, name) = (path.display().to_string(), names.next().unwrap_or_default());
         let (reference, estimate) = (&reference.trajectory, &estimate.trajectory);
         let result =
             evaluation::rpe(reference, estimate, &options).with_context(|| file.clone())?;
@@ -568,7 +575,10 @@ fn sub_trajectory_table(reports: &[EstimateReport]) -> Table {
 }
 
 fn nees(args: &NeesArgs) -> anyhow::Result<()> {
-    let reference = read(&args.reference)?;
+    if matches!(args.align, AlignArg::Sim3) {
+        wrong_usage("--align sim3: a belief has no scale".to_owned());
+    }
+    let reference = warn_of_order(&args.reference, evaluation::read_trajectory(&args.reference)?);
     let path = match args.directory.is_dir() {
         true => args.directory.join("state.csv"),
         false => args.directory.clone(),
@@ -803,27 +813,45 @@ impl Matching {
     }
 }
 
-fn read(path: &Path) -> anyhow::Result<TrajectoryFile> {
-    let file = evaluation::read_trajectory(path)?;
+fn warn_of_order(path: &Path, file: TrajectoryFile) -> TrajectoryFile {
     if file.reordered > 0 {
         let count = file.reordered;
         eprintln!("warning: {}: {count} poses were out of order and sorted", path.display());
     }
-    Ok(file)
+    file
 }
 
-/// Reads an estimate that can be compared with `reference`: both with stamps, or both without and
-/// of the same length.
-fn read_beside(path: &Path, reference: &TrajectoryFile) -> anyhow::Result<TrajectoryFile> {
-    let estimate = read(path)?;
+impl Inputs {
+    /// The reference and the estimates, read side by side: parsing is most of the work.
+    fn read(&self) -> anyhow::Result<(TrajectoryFile, Vec<TrajectoryFile>)> {
+        let (reference, estimates) = rayon::join(
+            || evaluation::read_trajectory(&self.reference),
+            || self.estimates.par_iter().map(|path| evaluation::read_trajectory(path)).collect(),
+        );
+        let reference = warn_of_order(&self.reference, reference?);
+        let estimates: Vec<Result<TrajectoryFile, EvaluationError>> = estimates;
+        let mut checked = Vec::new();
+        for (path, estimate) in self.estimates.iter().zip(estimates) {
+            let estimate = warn_of_order(path, estimate?);
+            check_comparable(path, &reference, &estimate)?;
+            checked.push(estimate);
+        }
+        Ok((reference, checked))
+    }
+}
+
+/// Both must have stamps, or neither and the same number of poses.
+fn check_comparable(
+    path: &Path,
+    reference: &TrajectoryFile,
+    estimate: &TrajectoryFile,
+) -> anyhow::Result<()> {
     let without_stamps = |file: &TrajectoryFile| file.format == TrajectoryFormat::Kitti;
-    let (theirs, ours) = (&reference.trajectory, &estimate.trajectory);
-    match (without_stamps(reference), without_stamps(&estimate)) {
-        (true, true) if theirs.len() != ours.len() => bail!(
-            "{}: {} poses without stamps, the reference has {}: which belong together?",
+    let (theirs, ours) = (reference.trajectory.len(), estimate.trajectory.len());
+    match (without_stamps(reference), without_stamps(estimate)) {
+        (true, true) if theirs != ours => bail!(
+            "{}: {ours} poses without stamps, the reference has {theirs}: which belong together?",
             path.display(),
-            ours.len(),
-            theirs.len()
         ),
         (true, false) | (false, true) => bail!(
             "{}: is {}, the reference is {}: only one of them has stamps",
@@ -831,10 +859,26 @@ fn read_beside(path: &Path, reference: &TrajectoryFile) -> anyhow::Result<Trajec
             estimate.format,
             reference.format
         ),
-        _ => Ok(estimate),
+        _ => Ok(()),
     }
 }
 
-fn name_of(path: &Path) -> String {
-    path.file_stem().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+/// File names without extension; where they are not all different, the paths without what they
+/// have in common at the front.
+fn short_names(paths: &[PathBuf]) -> Vec<String> {
+    let stem = |path: &PathBuf| path.file_stem().unwrap_or(path.as_os_str()).to_owned();
+    let stems: BTreeSet<_> = paths.iter().map(stem).collect();
+    if stems.len() == paths.len() {
+        return paths.iter().map(|path| stem(path).to_string_lossy().into_owned()).collect();
+    }
+    let common = (0..)
+        .take_while(|&depth| {
+            let part =
+                |path: &PathBuf| path.components().nth(depth).map(|c| c.as_os_str().to_owned());
+            let first = paths.first().and_then(part);
+            first.is_some() && paths.iter().all(|path| part(path) == first)
+        })
+        .count();
+    let rest = |path: &PathBuf| path.components().skip(common).collect::<PathBuf>();
+    paths.iter().map(|path| rest(path).display().to_string()).collect()
 }

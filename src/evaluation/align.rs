@@ -1,8 +1,7 @@
 use std::fmt;
 
 use nalgebra::{
-    Isometry3, Matrix3, Matrix4, Point3, Quaternion, SymmetricEigen, UnitQuaternion, Vector3,
-    Vector4,
+    Isometry3, Matrix3, Matrix4, Quaternion, SymmetricEigen, UnitQuaternion, Vector3, Vector4,
 };
 use serde::ser::{Serialize, SerializeStruct, Serializer};
 
@@ -68,10 +67,6 @@ impl Similarity {
     pub fn apply(&self, pose: &Isometry3<f64>) -> Isometry3<f64> {
         let position = self.scale * (self.rotation * pose.translation.vector) + self.translation;
         Isometry3::from_parts(position.into(), self.rotation * pose.rotation)
-    }
-
-    pub fn apply_point(&self, point: &Point3<f64>) -> Point3<f64> {
-        Point3::from(self.scale * (self.rotation * point.coords) + self.translation)
     }
 }
 

@@ -96,7 +96,7 @@ impl Method {
         let runs = if directory.join(METRICS).is_file() {
             vec![Run::read(directory)?]
         } else {
-            let io = |source| EvaluationError::Io { path: directory.to_owned(), source };
+            let io = |error| EvaluationError::Io { path: directory.to_owned(), error };
             let mut directories = Vec::new();
             for entry in std::fs::read_dir(directory).map_err(io)? {
                 let path = entry.map_err(io)?.path();
@@ -133,7 +133,7 @@ impl Run {
     fn read(directory: &Path) -> Result<Self, EvaluationError> {
         let path = directory.join(METRICS);
         let text = std::fs::read_to_string(&path)
-            .map_err(|source| EvaluationError::Io { path: path.clone(), source })?;
+            .map_err(|error| EvaluationError::Io { path: path.clone(), error })?;
         let metrics: Metrics = serde_json::from_str(&text)
             .map_err(|e| EvaluationError::Format { path, reason: e.to_string() })?;
         let evaluation = metrics.evaluation.as_ref();

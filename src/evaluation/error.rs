@@ -5,8 +5,8 @@ use super::Alignment;
 /// Why a trajectory cannot be read or two of them cannot be compared.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
-    #[error("{path}: {source}")]
-    Io { path: PathBuf, source: std::io::Error },
+    #[error("{path}: {error}")]
+    Io { path: PathBuf, error: std::io::Error },
     #[error("{path}: {reason}")]
     Format { path: PathBuf, reason: String },
     #[error("{path}, line {line}: {reason}")]

@@ -18,7 +18,7 @@ mod guards;
 mod nees;
 mod plot;
 mod relative;
-pub mod report;
+mod report;
 mod statistics;
 mod sub_trajectory;
 mod table;

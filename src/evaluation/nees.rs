@@ -6,7 +6,7 @@ use nalgebra::{
 use serde::Serialize;
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-use super::association::matches;
+use super::association::{MIN_MATCHES, matches};
 use super::{
     Alignment, AssociationOptions, EvaluationError, PosePairs, Statistics, Trajectory, align,
     guards,
@@ -30,7 +30,7 @@ const QUATERNION: [&str; 4] = ["qx", "qy", "qz", "qw"];
 /// Reads stamp, pose and the columns `cov_pose_00` to `cov_pose_55` of a `state.csv`.
 pub fn read_believed_trajectory(path: &Path) -> Result<BelievedTrajectory, EvaluationError> {
     let text = std::fs::read_to_string(path)
-        .map_err(|source| EvaluationError::Io { path: path.to_owned(), source })?;
+        .map_err(|error| EvaluationError::Io { path: path.to_owned(), error })?;
     let whole = |reason: String| EvaluationError::Format { path: path.to_owned(), reason };
     let mut lines = text.lines().zip(1..).filter(|(line, _)| !line.trim().is_empty());
     let (header, _) = lines.next().ok_or_else(|| whole("holds no header line".to_owned()))?;
@@ -186,7 +186,7 @@ pub fn nees(
     }
     let trajectory = &estimate.trajectory;
     let indices = matches(reference, trajectory, &options.association)?;
-    if indices.len() < super::association::MIN_MATCHES {
+    if indices.len() < MIN_MATCHES {
         return Err(guards::too_few_matches(
             reference,
             trajectory,

@@ -83,8 +83,8 @@ pub struct BoxPanel {
 pub enum PlotError {
     #[error("{path}: a plot is saved as .svg or .png")]
     Extension { path: PathBuf },
-    #[error("{path}: {source}")]
-    Io { path: PathBuf, source: std::io::Error },
+    #[error("{path}: {error}")]
+    Io { path: PathBuf, error: std::io::Error },
     #[error("drawing failed: {0}")]
     Drawing(String),
 }
@@ -161,7 +161,7 @@ impl Figure {
     pub fn save(&self, path: &Path) -> Result<(), PlotError> {
         match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
             Some("svg") => std::fs::write(path, self.to_svg()?)
-                .map_err(|source| PlotError::Io { path: path.to_owned(), source }),
+                .map_err(|error| PlotError::Io { path: path.to_owned(), error }),
             Some("png") => {
                 let (width, height) = self.size();
                 let size = (width * PNG_SCALE, height * PNG_SCALE);
@@ -222,6 +222,8 @@ type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoor
 
 /// Room around the axes: top, right, bottom (labels), left (labels).
 const MARGINS: [u32; 4] = [34, 20, 44, 64];
+/// Room above a panel without title.
+const BARE_TOP: u32 = 10;
 /// Room left of a panel, so that its labels stay clear of its neighbour.
 const SPACE: u32 = 14;
 const COLOR_BAR: u32 = 84;
@@ -239,16 +241,17 @@ impl Canvas {
         color.to_rgba().stroke_width(self.px(width))
     }
 
-    /// Axes with grid and labels.
+    /// Axes with grid and labels; `named`: what stands along x is not numbers.
     fn chart<'a, DB: DrawingBackend + 'a>(
         self,
         area: &DrawingArea<DB, Shift>,
         title: &str,
         labels: [&str; 2],
         ranges: [[f64; 2]; 2],
-        x_names: Option<&dyn Fn(&f64) -> String>,
+        named: bool,
     ) -> Result<Chart<'a, DB>, PlotError> {
         let [top, right, bottom, left] = MARGINS.map(|margin| self.px(margin));
+        let top = if title.is_empty() { self.px(BARE_TOP) } else { top };
         let (width, _) = area.dim_in_pixel();
         let style = self.text(14).pos(Pos::new(HPos::Center, VPos::Center));
         let centre = (self.px(SPACE) + left + width.saturating_sub(right)) / 2;
@@ -263,14 +266,12 @@ impl Canvas {
             .y_label_area_size(left)
             .build_cartesian_2d(x[0]..x[1], y[0]..y[1])
             .map_err(drawing)?;
+        let mut mesh = chart.configure_mesh();
+        if named {
+            mesh.disable_x_mesh();
+        }
         let (x_ticks, y_ticks) = (ticks(x), ticks(y));
-        let x_names: &dyn Fn(&f64) -> String = match x_names {
-            Some(names) => names,
-            None => &x_ticks,
-        };
-        chart
-            .configure_mesh()
-            .light_line_style(TRANSPARENT)
+        mesh.light_line_style(TRANSPARENT)
             .bold_line_style(self.line(GRID, 1))
             .axis_style(self.line(BLACK, 1))
             .label_style(self.text(12))
@@ -279,7 +280,7 @@ impl Canvas {
             .y_labels(7)
             .x_desc(labels[0])
             .y_desc(labels[1])
-            .x_label_formatter(x_names)
+            .x_label_formatter(&|value| if named { String::new() } else { x_ticks(value) })
             .y_label_formatter(&y_ticks)
             .draw()
             .map_err(drawing)?;
@@ -317,7 +318,7 @@ impl Canvas {
         let points = || panel.reference.iter().chain(&panel.estimate);
         let ranges = equal_scales([0, 1].map(|k| extent(points().map(|p| p[k]))), inner);
         let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
-        let mut chart = self.chart(&left, &panel.title, labels, ranges, None)?;
+        let mut chart = self.chart(&left, &panel.title, labels, ranges, false)?;
         for run in runs(&panel.reference) {
             let points = thinned(run).map(|p| (p[0], p[1]));
             chart.draw_series(LineSeries::new(points, self.line(REFERENCE, 1))).map_err(drawing)?;
@@ -376,7 +377,7 @@ impl Canvas {
         let y_max = panel.y_max.unwrap_or(f64::INFINITY);
         let ranges = [extent(x), padded(extent(y.map(|value| value.min(y_max))))];
         let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
-        let mut chart = self.chart(area, &panel.title, labels, ranges, None)?;
+        let mut chart = self.chart(area, &panel.title, labels, ranges, false)?;
         let mut names = 0;
         for (band, color) in panel.bands.iter().zip(COLORS.iter().cycle()) {
             let color = color.mix(0.18);
@@ -431,7 +432,7 @@ impl Canvas {
         let count = panel.groups.len().max(1) as f64;
         let ranges = [[0.0, count], padded(highest)];
         let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
-        let mut chart = self.chart(area, &panel.title, labels, ranges, Some(&|_| String::new()))?;
+        let mut chart = self.chart(area, &panel.title, labels, ranges, true)?;
         let style = self.text(12).pos(Pos::new(HPos::Center, VPos::Top));
         let names = panel.groups.iter().enumerate().map(|(index, (name, _))| {
             let below = (0, self.px(8) as i32);
@@ -518,7 +519,8 @@ fn equal_scales(ranges: [[f64; 2]; 2], pixels: [u32; 2]) -> [[f64; 2]; 2] {
 /// Writes numbers with as many decimals as ticks on `range` need.
 fn ticks(range: [f64; 2]) -> impl Fn(&f64) -> String {
     let spread = (range[1] - range[0]).abs().max(f64::MIN_POSITIVE);
-    let decimals = (1.3 - spread.log10()).ceil().clamp(0.0, 9.0) as usize;
+    // A step is at least a seventh of the range.
+    let decimals = (0.8 - spread.log10()).ceil().clamp(0.0, 9.0) as usize;
     let tiny = 1e-9 * spread;
     move |value| {
         let value = if value.abs() < tiny { 0.0 } else { *value };

@@ -29,7 +29,7 @@ figure{margin:1em 0}svg{max-width:100%;height:auto}";
 /// Writes `report` as one HTML file without references to others.
 pub fn write_html(path: &Path, report: &Report) -> Result<(), PlotError> {
     std::fs::write(path, to_html(report)?)
-        .map_err(|source| PlotError::Io { path: path.to_owned(), source })
+        .map_err(|error| PlotError::Io { path: path.to_owned(), error })
 }
 
 fn to_html(report: &Report) -> Result<String, PlotError> {

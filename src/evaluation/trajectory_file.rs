@@ -45,7 +45,7 @@ pub struct TrajectoryFile {
 /// that are not finite and lines of another length are errors with the line's number.
 pub fn read_trajectory(path: &Path) -> Result<TrajectoryFile, EvaluationError> {
     let bytes = std::fs::read(path)
-        .map_err(|source| EvaluationError::Io { path: path.to_owned(), source })?;
+        .map_err(|error| EvaluationError::Io { path: path.to_owned(), error })?;
     let text = std::str::from_utf8(&bytes).map_err(|_| EvaluationError::Format {
         path: path.to_owned(),
         reason: "not a text file".to_owned(),
