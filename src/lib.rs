@@ -10,6 +10,7 @@ pub mod config;
 pub mod dataset;
 pub mod distribution;
 pub mod evaluation;
+pub mod experiment;
 pub mod filter;
 pub mod inertial;
 pub mod map;

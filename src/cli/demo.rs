@@ -7,7 +7,7 @@ use super::simulate::render;
 use super::terminal::catch_interrupts;
 use mfg_vio::config::Config;
 use mfg_vio::dataset;
-use mfg_vio::evaluation::report::write_html;
+use mfg_vio::evaluation::write_html;
 use mfg_vio::replay::report;
 use mfg_vio::simulation::SceneConfig;
 

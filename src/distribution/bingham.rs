@@ -120,9 +120,14 @@ impl Bingham {
         self.axes.column(0).into_owned()
     }
 
+    /// `M^T q`, the quaternion in principal axes.
+    pub fn centred(&self, q: &Vector4<f64>) -> Vector4<f64> {
+        self.axes.tr_mul(q)
+    }
+
     /// Logarithm of the density at the unit quaternion `q`.
     pub fn log_density(&self, q: &Vector4<f64>) -> f64 {
-        let x = self.axes.tr_mul(q);
+        let x = self.centred(q);
         let exponent: f64 = (0..3).map(|i| self.z[i] * x[i + 1] * x[i + 1]).sum();
         exponent - self.fisher.moments().log_c_scaled()
     }

@@ -1,7 +1,7 @@
 //! Tables and figures of one replay.
 
 use super::Replayed;
-use crate::evaluation::report::Report;
+use crate::evaluation::Report;
 use crate::evaluation::{
     ApeOptions, Cell, EvaluationError, Figure, Table, ape, counts_figure, error_figure,
     stage_times_figure, trajectory_figure,

@@ -29,6 +29,7 @@ mod mle;
 mod moments;
 mod near_uniform;
 mod quadrature;
+mod recursion;
 mod sampler;
 mod subset;
 
@@ -45,6 +46,7 @@ pub use mle::{
     MomentError, s_from_complement, s_from_complement_near, s_from_d, s_from_quaternion_squares,
 };
 pub use moments::Moments;
+pub use recursion::{HigherMomentError, HigherMoments, MAX_ORDER};
 pub use sampler::MatrixFisherSampler;
 pub use subset::SubsetConcentration;
 

@@ -39,6 +39,9 @@ where
     pub x: OVector<f64, D>,
 }
 
+/// `Cov[x]`, `Cov[x, e]` and `Cov[e]` of a Gaussian of `x` and the rotation vector `e`.
+pub type GaussianBlocks<D> = (OMatrix<f64, D, D>, OMatrix<f64, D, U3>, Matrix3<f64>);
+
 impl<D: Dim> MatrixFisherGaussian<D>
 where
     DefaultAllocator:
@@ -118,7 +121,7 @@ where
     /// distribution (3.15): `Cov[x]`, `Cov[x, e]` and `Cov[e]`.
     ///
     /// `None` unless the attitude is concentrated about all axes, `s2 + s3 > 0`.
-    pub fn to_gaussian(&self) -> Option<(OMatrix<f64, D, D>, OMatrix<f64, D, U3>, Matrix3<f64>)> {
+    pub fn to_gaussian(&self) -> Option<GaussianBlocks<D>> {
         let v = self.attitude().svd().v;
         let rotation = self.attitude().information().cholesky()?.inverse();
         Some((self.sigma(), self.p() * v.matrix().transpose(), rotation))

@@ -1,0 +1,3 @@
+//! The papers' numerical studies, as functions that return plain values.
+
+pub mod matrix_fisher;
