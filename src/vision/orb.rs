@@ -27,10 +27,8 @@ const BORDER: usize = PATCH_RADIUS + 1;
 const BLOCK: usize = 64;
 /// FAST compares a pixel with a circle of this radius, and its score with that of the neighbours.
 const FAST_MARGIN: usize = 4;
-/// A block with fewer corners than this is searched again with the lower threshold.
-const FEW_IN_BLOCK: usize = 8;
 /// Corners taken from a block of one level, at most, as a multiple of its share of the features.
-const SHARE_OF_BLOCK: usize = 2;
+const SHARES_OF_BLOCK: usize = 2;
 
 /// A corner within a block: column, row and FAST score.
 struct BlockCorner {
@@ -166,12 +164,12 @@ impl OrbExtractor {
             return Ok(());
         }
         let in_full_image = width.div_ceil(BLOCK) * height.div_ceil(BLOCK);
-        let most = SHARE_OF_BLOCK * self.config.max_features.div_ceil(in_full_image);
+        let share = self.config.max_features.div_ceil(in_full_image);
         let scale = Vector2::new(width as f64 / columns as f64, height as f64 / rows as f64);
         for (left, across) in blocks(columns) {
             for (top, down) in blocks(rows) {
                 let block = Rect::new(left as i32, top as i32, across as i32, down as i32);
-                for point in self.detect_in(&image.roi(block)?, most)? {
+                for point in self.detect_in(&image.roi(block)?, share)? {
                     let (column, row) = (left + point.x, top + point.y);
                     corners.push(Corner {
                         pixel: full_pixel(Point2::new(column as f64, row as f64), scale),
@@ -186,20 +184,22 @@ impl OrbExtractor {
         Ok(())
     }
 
-    /// The strongest corners of a block, with the lower threshold where the higher one finds few.
+    /// The strongest corners of a block; with the lower threshold where the higher one finds fewer
+    /// than the block's `share` of all features.
     fn detect_in(
         &mut self,
         block: &BoxedRef<Mat>,
-        most: usize,
+        share: usize,
     ) -> Result<Vec<BlockCorner>, VisionError> {
         let mut found = Vector::<KeyPoint>::new();
         self.fast.detect_def(block, &mut found)?;
-        if found.len() < FEW_IN_BLOCK {
+        if found.len() < share {
             self.sensitive.detect_def(block, &mut found)?;
         }
         // Before the points cross over from OpenCV one by one.
         KeyPointsFilter::run_by_image_border(&mut found, block.size()?, FAST_MARGIN as i32)?;
-        KeyPointsFilter::retain_best(&mut found, most.try_into().unwrap_or(i32::MAX))?;
+        let most = i32::try_from(SHARES_OF_BLOCK * share).unwrap_or(i32::MAX);
+        KeyPointsFilter::retain_best(&mut found, most)?;
         let corner = |point: KeyPoint| BlockCorner {
             x: point.pt().x as usize,
             y: point.pt().y as usize,
