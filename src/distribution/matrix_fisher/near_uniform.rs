@@ -14,11 +14,11 @@ use super::engine::{EvenMoments, Sums};
 use super::forms::{Basis, CUBICS, MONOMIALS};
 
 /// The series serves `s1 + s2` up to this.
-pub(super) const MAX_SUM: f64 = 1.0 / 32.0;
+pub(super) const MAX_SUM: f64 = 1.0 / 64.0;
 
 /// Degree of the series. The first term left out of a third derivative is below
-/// `(3/64)^10/10! < 2e-20` of the leading one.
-const DEGREE: usize = 12;
+/// `(3/128)^8/8! < 3e-18` of the leading one.
+const DEGREE: usize = 10;
 /// Order of the derivatives.
 const ORDER: usize = 3;
 
@@ -28,15 +28,14 @@ static TERMS: LazyLock<Vec<([usize; 3], f64)>> = LazyLock::new(haar_moments);
 pub(super) fn pass(sums: &Sums) -> EvenMoments {
     let s = sums.singular_values();
     let cubics = derivatives(&s.into());
-    let c = cubics[constant()];
+    let c = cubics[CONSTANT];
     let cubics = cubics.map(|d| d / c);
-    let moment = |p: [usize; 3]| cubics[index(p)];
     // x_i^2 = (1 + Q_ii - Q_jj - Q_kk)/4
     let sign = |i: usize, j: usize| if i == j { 1.0 } else { -1.0 };
-    let first = |i: usize| -> f64 { (0..3).map(|j| sign(i, j) * moment(power(&[j]))).sum() };
+    let first = |i: usize| -> f64 { (0..3).map(|j| sign(i, j) * cubics[FIRST[j]]).sum() };
     let second = |i: usize, j: usize| -> f64 {
         let pairs = (0..3).flat_map(|k| (0..3).map(move |l| (k, l)));
-        pairs.map(|(k, l)| sign(i, k) * sign(j, l) * moment(power(&[k, l]))).sum()
+        pairs.map(|(k, l)| sign(i, k) * sign(j, l) * cubics[SECOND[k][l]]).sum()
     };
     let squares = std::array::from_fn(|i| 0.25 * (1.0 + first(i)));
     let products = std::array::from_fn(|i| {
@@ -46,22 +45,39 @@ pub(super) fn pass(sums: &Sums) -> EvenMoments {
     EvenMoments { log_c_scaled, squares, products, cubics, basis: Basis::Diagonal }
 }
 
-/// Exponents of a product of diagonal entries.
-fn power(entries: &[usize]) -> [usize; 3] {
-    let mut exponents = [0; 3];
-    for &i in entries {
-        exponents[i] += 1;
+/// Positions of the constant, of `E[Q_ii]` and of `E[Q_ii Q_jj]` among the cubic moments.
+const CONSTANT: usize = position([0, 0, 0]);
+const FIRST: [usize; 3] = [position([1, 0, 0]), position([0, 1, 0]), position([0, 0, 1])];
+const SECOND: [[usize; 3]; 3] = [
+    [position([2, 0, 0]), position([1, 1, 0]), position([1, 0, 1])],
+    [position([1, 1, 0]), position([0, 2, 0]), position([0, 1, 1])],
+    [position([1, 0, 1]), position([0, 1, 1]), position([0, 0, 2])],
+];
+
+/// Positions of all derivatives by their exponents; unused ones are zero.
+const POSITIONS: [[[usize; ORDER + 1]; ORDER + 1]; ORDER + 1] = positions();
+
+const fn position(exponents: [usize; 3]) -> usize {
+    let mut n = 0;
+    while n < CUBICS {
+        let m = MONOMIALS[n];
+        if m[1] == exponents[0] && m[2] == exponents[1] && m[3] == exponents[2] {
+            return n;
+        }
+        n += 1;
     }
-    exponents
+    CUBICS
 }
 
-/// Position of a derivative among the cubic moments.
-fn index(exponents: [usize; 3]) -> usize {
-    MONOMIALS.iter().position(|m| m[1..] == exponents).unwrap_or_default()
-}
-
-fn constant() -> usize {
-    index([0; 3])
+const fn positions() -> [[[usize; ORDER + 1]; ORDER + 1]; ORDER + 1] {
+    let mut table = [[[0; ORDER + 1]; ORDER + 1]; ORDER + 1];
+    let mut n = 0;
+    while n < CUBICS {
+        let m = MONOMIALS[n];
+        table[m[1]][m[2]][m[3]] = n;
+        n += 1;
+    }
+    table
 }
 
 /// `d^n c / ds1^i ds2^j ds3^k` for `n <= 3`.
@@ -78,12 +94,14 @@ fn derivatives(s: &[f64; 3]) -> [f64; CUBICS] {
     });
     let mut sums = [0.0; CUBICS];
     for ([i, j, k], moment) in TERMS.iter() {
-        for (sum, [_, p, q, r]) in sums.iter_mut().zip(MONOMIALS) {
-            let factor = |axis: usize, n: usize| powers[axis][n];
-            *sum += moment
-                * factor(0, i + ORDER - p)
-                * factor(1, j + ORDER - q)
-                * factor(2, k + ORDER - r);
+        for p in 0..=ORDER {
+            let first = moment * powers[0][i + ORDER - p];
+            for q in 0..=ORDER - p {
+                let second = first * powers[1][j + ORDER - q];
+                for r in 0..=ORDER - p - q {
+                    sums[POSITIONS[p][q][r]] += second * powers[2][k + ORDER - r];
+                }
+            }
         }
     }
     sums

@@ -108,8 +108,8 @@ impl Integrals {
             let v = start + width * x;
             let u = v * v;
             let rho = (1.0 - v) * (1.0 + v);
-            let first = CircleMoments::new(sums.a[0] * rho);
-            let second = CircleMoments::new(sums.difference * u);
+            let first = CircleMoments::up_to::<THIRD>(sums.a[0] * rho);
+            let second = CircleMoments::up_to::<THIRD>(sums.difference * u);
             let measure = 2.0 * v * width * weight;
             let density =
                 (-2.0 * sums.a[1] * u).exp() * first.scaled_i0 * second.scaled_i0 * measure;

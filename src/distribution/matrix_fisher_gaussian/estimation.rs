@@ -39,8 +39,24 @@ where
     pub x: OVector<f64, D>,
 }
 
-/// `Cov[x]`, `Cov[x, e]` and `Cov[e]` of a Gaussian of `x` and the rotation vector `e`.
-pub type GaussianBlocks<D> = (OMatrix<f64, D, D>, OMatrix<f64, D, U3>, Matrix3<f64>);
+/// The Gaussian of `x` and the body-frame rotation vector `e` of `mode exp(e^)`, in which a
+/// concentrated matrix Fisher-Gaussian distribution ends (3.15).
+#[derive(Debug, Clone)]
+pub struct TangentGaussian<D: Dim>
+where
+    DefaultAllocator: Allocator<D> + Allocator<D, D> + Allocator<D, U3>,
+{
+    /// The mode of the attitude.
+    pub mode: Rotation3<f64>,
+    /// `E[x]`.
+    pub mean: OVector<f64, D>,
+    /// `Cov[x]`.
+    pub covariance: OMatrix<f64, D, D>,
+    /// `Cov[x, e]`.
+    pub cross: OMatrix<f64, D, U3>,
+    /// `Cov[e]`, rad^2.
+    pub rotation: Matrix3<f64>,
+}
 
 impl<D: Dim> MatrixFisherGaussian<D>
 where
@@ -101,30 +117,30 @@ where
         Self::from_moments(attitude, correlation, &moments)
     }
 
-    /// The distribution that a concentrated Gaussian of `x` and the body-frame rotation vector
-    /// `e` of `mode exp(e^)` approximates (theorem 3.4 read backwards): `cross = Cov[x, e]`.
+    /// The distribution that a concentrated Gaussian approximates (theorem 3.4 read backwards,
+    /// with FNF 31 for the attitude).
     pub fn from_gaussian(
-        mode: Rotation3<f64>,
-        mu: OVector<f64, D>,
-        sigma: OMatrix<f64, D, D>,
-        cross: &OMatrix<f64, D, U3>,
-        rotation: &Matrix3<f64>,
+        gaussian: &TangentGaussian<D>,
         correlation: Correlation,
     ) -> Result<Self, MfgError> {
-        let inverse = rotation.cholesky().ok_or(MfgError::RotationCovariance)?.inverse();
-        let attitude = MatrixFisher::from_mode_and_information(mode, inverse)?;
-        let p = cross * attitude.svd().v.matrix();
-        Self::new(attitude, mu, sigma, p, correlation)
+        let factor = gaussian.rotation.cholesky().ok_or(MfgError::RotationCovariance)?;
+        let attitude = MatrixFisher::from_mode_and_information(gaussian.mode, factor.inverse())?;
+        let p = &gaussian.cross * attitude.svd().v.matrix();
+        Self::new(attitude, gaussian.mean.clone(), gaussian.covariance.clone(), p, correlation)
     }
 
-    /// The Gaussian of `x` and the body-frame rotation vector that approximates a concentrated
-    /// distribution (3.15): `Cov[x]`, `Cov[x, e]` and `Cov[e]`.
-    ///
-    /// `None` unless the attitude is concentrated about all axes, `s2 + s3 > 0`.
-    pub fn to_gaussian(&self) -> Option<GaussianBlocks<D>> {
+    /// The Gaussian that approximates a concentrated distribution (3.15); an error unless the
+    /// attitude is concentrated about all axes, `s2 + s3 > 0`.
+    pub fn to_gaussian(&self) -> Result<TangentGaussian<D>, MfgError> {
         let v = self.attitude().svd().v;
-        let rotation = self.attitude().information().cholesky()?.inverse();
-        Some((self.sigma(), self.p() * v.matrix().transpose(), rotation))
+        let factor = self.attitude().information().cholesky();
+        Ok(TangentGaussian {
+            mode: self.attitude().mode(),
+            mean: self.mu().clone(),
+            covariance: self.sigma(),
+            cross: self.p() * v.matrix().transpose(),
+            rotation: factor.ok_or(MfgError::RotationCovariance)?.inverse(),
+        })
     }
 
     /// The moments of the conditional part that [`from_moments`](Self::from_moments) inverts.

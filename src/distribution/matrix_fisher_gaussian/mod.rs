@@ -38,7 +38,7 @@ use super::matrix_fisher::{
 };
 use crate::so3::{ProperSvd, exp, vee};
 
-pub use estimation::{ConditionalMoments, WeightedSample};
+pub use estimation::{ConditionalMoments, TangentGaussian, WeightedSample};
 
 /// The frame whose rotations `x` is correlated with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

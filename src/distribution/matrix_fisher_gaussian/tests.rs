@@ -147,16 +147,8 @@ fn samples_give_the_parameters_back() {
 #[test]
 fn gaussian_approximation_works_both_ways() {
     let belief = belief([3e4, 2e4, 1e4], Correlation::World);
-    let (sigma, cross, rotation) = belief.to_gaussian().unwrap();
-    let found = MatrixFisherGaussian::from_gaussian(
-        belief.attitude().mode(),
-        *belief.mu(),
-        sigma,
-        &cross,
-        &rotation,
-        Correlation::World,
-    )
-    .unwrap();
+    let gaussian = belief.to_gaussian().unwrap();
+    let found = MatrixFisherGaussian::from_gaussian(&gaussian, Correlation::World).unwrap();
     assert!(found.is_equivalent(&belief, 1e-9));
     // And it is the limit: Cov[x, e] of the distribution itself.
     let mut rng = ChaCha8Rng::seed_from_u64(4);
@@ -167,7 +159,8 @@ fn gaussian_approximation_works_both_ways() {
         let e = crate::so3::log(&(mode.inverse() * r));
         sampled += (x - belief.mu()) * e.transpose() / n as f64;
     }
-    let scale = (belief.sigma()[(0, 0)] * rotation.trace() / n as f64).sqrt();
+    let scale = (belief.sigma()[(0, 0)] * gaussian.rotation.trace() / n as f64).sqrt();
+    let cross = gaussian.cross;
     assert!((sampled - cross).amax() < 5.0 * scale, "{sampled} {cross}");
 }
 
