@@ -19,8 +19,8 @@ impl Mekf {
         Self { config: config.clone(), propagator, belief }
     }
 
-    fn correct(&mut self, information: &PoseInformation) -> Option<()> {
-        let state = &mut self.belief.state;
+    fn corrected(&self, information: &PoseInformation) -> Option<Belief> {
+        let mut state = self.belief.state;
         let rotation = state.world_from_body.rotation.to_rotation_matrix();
         let (lambda, vector) = information.linearized(&rotation);
 
@@ -44,8 +44,7 @@ impl Mekf {
         state.velocity += part(block::VELOCITY);
         state.gyro_bias += part(block::GYRO_BIAS);
         state.accel_bias += part(block::ACCEL_BIAS);
-        self.belief.covariance = covariance;
-        Some(())
+        Some(Belief { state, covariance })
     }
 }
 
@@ -54,8 +53,8 @@ impl VisualInertialFilter for Mekf {
         &self.belief
     }
 
-    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) {
-        self.propagator.propagate(&mut self.belief, from, to);
+    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool {
+        self.propagator.propagate(&mut self.belief, from, to)
     }
 
     fn coast(&mut self, seconds: f64) {
@@ -72,7 +71,7 @@ impl VisualInertialFilter for Mekf {
             return None;
         }
         let innovation = normalized_innovation(&information, &self.belief)?;
-        self.correct(&information)?;
+        self.belief = self.corrected(&information).filter(Belief::is_finite)?;
         Some(UpdateOutcome { innovation, points: information.points })
     }
 

@@ -43,8 +43,8 @@ impl VisualInertialFilter for MfgFilter {
         &self.belief
     }
 
-    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) {
-        self.propagator.propagate(&mut self.belief, from, to);
+    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool {
+        self.propagator.propagate(&mut self.belief, from, to)
     }
 
     fn coast(&mut self, seconds: f64) {
@@ -74,7 +74,7 @@ impl VisualInertialFilter for MfgFilter {
             position = belief.state.world_from_body.translation.vector;
             posterior = Some(belief);
         }
-        self.belief = posterior?;
+        self.belief = posterior.filter(Belief::is_finite)?;
         Some(UpdateOutcome { innovation: innovation?, points })
     }
 

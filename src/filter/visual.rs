@@ -163,13 +163,15 @@ pub trait VisualInertialFilter: Send {
     /// The current belief, in the concentrated form of W22 Theorem 3.4.
     fn belief(&self) -> &Belief;
 
-    /// Moves the belief from the time of `from` to that of `to`.
-    fn propagate(&mut self, from: &ImuSample, to: &ImuSample);
+    /// Moves the belief from the time of `from` to that of `to`. False, and no change, if no
+    /// finite belief follows from the samples.
+    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool;
 
     /// Moves the belief on by `seconds` without an IMU.
     fn coast(&mut self, seconds: f64);
 
-    /// Conditions the belief on matched points; no points leave it unchanged.
+    /// Conditions the belief on matched points. `None`, and no change, without points or if no
+    /// finite belief follows from them.
     fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome>;
 
     /// Proper singular values of the attitude's matrix Fisher part, if the filter has one.

@@ -61,14 +61,21 @@ impl Propagator {
     }
 
     /// Moves `belief` from the time of `from` to the time of `to`; an interval that is not
-    /// positive leaves it unchanged.
-    pub fn propagate(&self, belief: &mut Belief, from: &ImuSample, to: &ImuSample) {
+    /// positive leaves it unchanged. So do samples that no finite belief follows from: false.
+    pub fn propagate(&self, belief: &mut Belief, from: &ImuSample, to: &ImuSample) -> bool {
         let h = to.stamp.seconds_since(from.stamp);
-        if h > 0.0 {
-            let angular_velocity = (from.angular_velocity + to.angular_velocity) * 0.5;
-            let specific_force = (from.specific_force + to.specific_force) * 0.5;
-            self.step(belief, &angular_velocity, &specific_force, h);
+        if h <= 0.0 {
+            return true;
         }
+        let angular_velocity = (from.angular_velocity + to.angular_velocity) * 0.5;
+        let specific_force = (from.specific_force + to.specific_force) * 0.5;
+        let mut moved = *belief;
+        self.step(&mut moved, &angular_velocity, &specific_force, h);
+        let finite = moved.is_finite();
+        if finite {
+            *belief = moved;
+        }
+        finite
     }
 
     /// Carries `belief` over `h` seconds without measurements (constant velocity model).
@@ -265,6 +272,21 @@ mod tests {
         assert!(error(&rest, &still).norm() < 1e-12);
         let falling = stepped(rest, &Vector3::zeros(), &Vector3::zeros(), 0.1);
         assert!((falling.velocity.z + 0.1 * felt.z).abs() < 1e-12);
+    }
+
+    #[test]
+    fn samples_without_a_finite_outcome_change_nothing() {
+        let before = Belief { state: state(), covariance: NavCovariance::identity() };
+        let sample = |nanos, rate| ImuSample {
+            stamp: Stamp::from_nanos(nanos),
+            angular_velocity: Vector3::repeat(rate),
+            specific_force: Vector3::zeros(),
+        };
+        let mut belief = before;
+        for rate in [f64::NAN, f64::INFINITY, 1e308] {
+            let moved = propagator().propagate(&mut belief, &sample(0, rate), &sample(9, rate));
+            assert!(!moved && belief == before, "{rate}");
+        }
     }
 
     #[test]

@@ -140,7 +140,8 @@ impl Initializer {
             ));
         };
         let Some(z_up) = self.z_up_from_truth(evidence, &pose) else {
-            return Attempt::NextFrame("`truth.up` has no direction".to_owned());
+            let reason = "`truth.up` has no direction, or is \"auto\" without an IMU";
+            return Attempt::NextFrame(reason.to_owned());
         };
         let world_from_body = Isometry3::from_parts(Translation3::identity(), z_up) * pose;
         let velocity = evidence

@@ -76,6 +76,9 @@ struct Running {
     /// Last sample used, its stamp being the time of the belief (interpolated at frames).
     last_imu: Option<ImuSample>,
     time: Stamp,
+    /// Whether the map had points to match before this frame.
+    expects_matches: bool,
+    lost_since: Option<Stamp>,
 }
 
 impl Odometry {
@@ -239,6 +242,8 @@ impl Odometry {
             map: Map::new(&self.config.map),
             last_imu: last_imu.map(|sample| ImuSample { stamp: time, ..sample }),
             time,
+            expects_matches: false,
+            lost_since: None,
         });
     }
 
@@ -266,14 +271,15 @@ impl Odometry {
         let (candidates, matches) = running.find_matches(&features, &view);
         times.matching = clock.lap();
 
-        let inliers = running.find_inliers(&features, &matches, &view);
+        let inliers = running.find_inliers(&matches, &view);
         times.ransac = clock.lap();
 
         let treatment = self.kind.map_treatment();
         let innovation = running.update(&matches, &inliers, treatment, &view);
-        if innovation.is_none() && number > 0 && !running.map.is_empty() {
+        if innovation.is_none() && running.expects_matches {
             self.stats.frames_without_update += 1;
         }
+        notes.extend(running.note_tracking(innovation.is_some(), stamp));
         times.update = clock.lap();
 
         let roles = running.grow_map(number, &features, &matches, &inliers, treatment, &view);
@@ -371,7 +377,10 @@ impl Running {
                 let text = format!("IMU gap of {interval:.3} s before {} s", to.stamp);
                 notes.push(Note { level: NoteLevel::Warning, text });
             }
-            filter.propagate(from, &to);
+            if !filter.propagate(from, &to) {
+                let text = format!("IMU samples up to {} s left out: no finite belief", to.stamp);
+                notes.push(Note { level: NoteLevel::Warning, text });
+            }
         };
         last.stamp = self.time;
         while let Some(sample) = imu.front().copied().filter(|sample| sample.stamp <= stamp) {
@@ -387,6 +396,25 @@ impl Running {
         self.last_imu = Some(at_frame);
         self.time = stamp;
         gaps
+    }
+
+    /// Tells when vision is lost, and when it is back.
+    fn note_tracking(&mut self, updated: bool, stamp: Stamp) -> Option<Note> {
+        let expected = std::mem::replace(&mut self.expects_matches, true);
+        match (updated, self.lost_since) {
+            (false, None) if expected => {
+                self.lost_since = Some(stamp);
+                let text = format!("vision lost at {stamp} s: too few matches agree");
+                Some(Note { level: NoteLevel::Warning, text })
+            }
+            (true, Some(since)) => {
+                self.lost_since = None;
+                let gap = stamp.seconds_since(since);
+                let text = format!("vision back at {stamp} s, after {gap:.2} s without");
+                Some(Note { level: NoteLevel::Info, text })
+            }
+            _ => None,
+        }
     }
 
     fn world_from_camera(&self, view: &View) -> Isometry3<f64> {
@@ -454,13 +482,7 @@ impl Running {
     }
 
     /// Indices into `matches` that agree on one pose.
-    fn find_inliers(
-        &self,
-        features: &Features,
-        matches: &[Association],
-        view: &View,
-    ) -> Vec<usize> {
-        debug_assert!(matches.iter().all(|m| m.feature < features.seen.len()));
+    fn find_inliers(&self, matches: &[Association], view: &View) -> Vec<usize> {
         let correspondences: Vec<_> = matches.iter().map(|m| m.correspondence).collect();
         let rotation = self.world_from_camera(view).rotation;
         let config = &view.config.ransac;

@@ -63,10 +63,6 @@ impl TruthTrack {
         }
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.poses.is_empty()
-    }
-
     pub fn newest(&self) -> Option<Stamp> {
         self.poses.back().map(|pose| pose.stamp)
     }
