@@ -69,6 +69,7 @@ const DEPTH: &str = "/cam0/depth";
 const CAMERA_INFO: &str = "/cam0/camera_info";
 const IMU: &str = "/imu";
 const TRUTH: &str = "/truth/pose";
+const TRANSFORM: &str = "/tf";
 const STATIC_TRANSFORM: &str = "/tf_static";
 
 const WORLD_FRAME: &str = "world";
@@ -122,13 +123,7 @@ impl LogWriter {
             });
         };
         self.camera = Some(camera.clone());
-        let transform = message::TransformStamped {
-            header: message::Header::new(stamp, BODY_FRAME),
-            child_frame_id: CAMERA_FRAME,
-            transform: (&body_from_camera).into(),
-        };
-        let message = message::TfMessage { transforms: vec![transform] };
-        self.write(STATIC_TRANSFORM, stamp, &message)
+        self.transform(STATIC_TRANSFORM, stamp, [BODY_FRAME, CAMERA_FRAME], &body_from_camera)
     }
 
     pub fn imu(&mut self, sample: &ImuSample) -> Result<(), WriteError> {
@@ -164,13 +159,31 @@ impl LogWriter {
         Ok(())
     }
 
+    /// Writes a pose, and the same as a transform, by which viewers place the camera.
     pub fn truth(&mut self, pose: &TruthPose) -> Result<(), WriteError> {
         let message = message::PoseStamped {
             header: message::Header::new(pose.stamp, WORLD_FRAME),
             pose: (&pose.world_from_body).into(),
         };
         self.summary.truth_poses += 1;
-        self.write(TRUTH, pose.stamp, &message)
+        self.write(TRUTH, pose.stamp, &message)?;
+        let frames = [WORLD_FRAME, BODY_FRAME];
+        self.transform(TRANSFORM, pose.stamp, frames, &pose.world_from_body)
+    }
+
+    fn transform(
+        &mut self,
+        topic: &'static str,
+        stamp: Stamp,
+        [parent, child]: [&'static str; 2],
+        parent_from_child: &Isometry3<f64>,
+    ) -> Result<(), WriteError> {
+        let transform = message::TransformStamped {
+            header: message::Header::new(stamp, parent),
+            child_frame_id: child,
+            transform: parent_from_child.into(),
+        };
+        self.write(topic, stamp, &message::TfMessage { transforms: vec![transform] })
     }
 
     pub fn event(&mut self, event: &Event) -> Result<(), WriteError> {
@@ -266,7 +279,7 @@ impl LogWriter {
             IMU => ("sensor_msgs/msg/Imu", message::IMU_DEFINITION),
             CAMERA_INFO => ("sensor_msgs/msg/CameraInfo", message::CAMERA_INFO_DEFINITION),
             TRUTH => ("geometry_msgs/msg/PoseStamped", message::POSE_DEFINITION),
-            STATIC_TRANSFORM => ("tf2_msgs/msg/TFMessage", message::TF_DEFINITION),
+            TRANSFORM | STATIC_TRANSFORM => ("tf2_msgs/msg/TFMessage", message::TF_DEFINITION),
             _ => ("sensor_msgs/msg/Image", message::IMAGE_DEFINITION),
         };
         let schema = self.mcap.add_schema(name, "ros2msg", definition.as_bytes())?;
@@ -636,6 +649,7 @@ mod tests {
                 ("/cam0/depth", "sensor_msgs/msg/Image"),
                 ("/imu", "sensor_msgs/msg/Imu"),
                 ("/truth/pose", "geometry_msgs/msg/PoseStamped"),
+                ("/tf", "tf2_msgs/msg/TFMessage"),
             ]
         );
     }

@@ -1,4 +1,22 @@
 //! Probability distributions on SO(3) and SO(3) x R^n.
+//!
+//! A short course, in the order in which to read it:
+//!
+//! 1. [`matrix_fisher`]: the "Gaussian" of attitudes, exact from the uniform distribution to the
+//!    limits of double precision.
+//! 2. [`Bingham`]: the same distribution, written on unit quaternions.
+//! 3. [`VonMisesFisher`]: measured directions; [`ConcentratedGaussian`]: the Gaussian of rotation
+//!    vectors, wrapped around SO(3).
+//! 4. [`matrix_fisher_gaussian`]: attitude and vector together, correlated;
+//!    [`BinghamGaussian`] is its twin on quaternions.
+//! 5. [`unscented`]: a handful of weighted points that stand for any of these.
+//!
+//! Densities are with respect to the uniform distribution on the rotations (spheres) and to
+//! Lebesgue measure on vectors. Short names of sources: **W22**, W. Wang, *Matrix Fisher-Gaussian
+//! distribution* (dissertation, 2022); **L-UAE**, T. Lee, *Global unscented attitude estimation
+//! via the matrix Fisher distributions on SO(3)*; **L-AMF**, T. Lee, *Bayesian attitude estimation
+//! with approximate matrix Fisher distributions on SO(3)*; **FNF**, Wang, Gui, Zhong on fast
+//! nonlinear filtering. Bare numbers in parentheses are equations of W22.
 
 mod bingham;
 mod bingham_gaussian;

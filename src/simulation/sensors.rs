@@ -175,9 +175,9 @@ impl Simulation {
     }
 
     fn frame(&mut self, stamp: Stamp, number: u64) -> Option<RgbdFrame> {
-        // `time_offset` is added by the reader to get the IMU's clock, so it is taken off here.
         let shot = self.shot(stamp, number);
         let (color, depth) = self.renderer.render(&shot)?;
+        // `time_offset` is added by the reader to get the IMU's clock, so it is taken off here.
         let stamp = stamp.offset_by(-self.config.camera.time_offset);
         Some(RgbdFrame { stamp, color, depth })
     }
@@ -370,8 +370,8 @@ mod tests {
         assert_eq!((summary.frames, summary.imu_samples, summary.truth_poses), (3, 60, 36));
         let bytes = std::fs::read(&path).unwrap();
         let statistics = mcap::Summary::read(&bytes).unwrap().unwrap().stats.unwrap();
-        // The static transform, three messages a frame, IMU and truth.
-        assert_eq!(statistics.message_count, 1 + 9 + 60 + 36);
+        // The static transform, three messages a frame, one a reading, two a true pose.
+        assert_eq!(statistics.message_count, 1 + 9 + 60 + 72);
     }
 
     #[test]

@@ -77,15 +77,16 @@ fn index(i: i32, len: usize, wraps: bool) -> usize {
 
 impl Texture {
     /// The mean over the parallelogram spanned by `dx` and `dy` (m) around `(u, v)` (m), by up to
-    /// four trilinear samples along its longer side.
+    /// three trilinear samples along its longer side.
     #[inline]
     pub fn sample(&self, u: f32, v: f32, dx: [f32; 2], dy: [f32; 2]) -> Color {
-        const MAX_SAMPLES: f32 = 4.0;
+        const MAX_RATIO: f32 = 4.0;
         let length = |e: [f32; 2]| (e[0] * e[0] + e[1] * e[1]).sqrt();
         let (lx, ly) = (length(dx), length(dy));
         let (long, axis, short) = if lx > ly { (lx, dx, ly) } else { (ly, dy, lx) };
-        let width = short.max(long / MAX_SAMPLES).max(1e-6);
-        let samples = (long / width + 0.5) as usize;
+        let width = short.max(long / MAX_RATIO).max(1e-6);
+        // Bilinear kernels overlap: three samples cover a footprint four times as long as wide.
+        let samples = (0.75 * long / width + 0.5) as usize;
         if samples < 2 {
             return self.trilinear(u, v, width);
         }
@@ -485,7 +486,8 @@ impl Material {
 }
 
 /// Paints one face of `width` by `height` metres; `richness` from 0 (bare) to 1 (busy). Texels of
-/// large faces have an edge of `texel` m, those of small ones down to half of it.
+/// large faces have an edge of `texel` m (more beyond 16 million of them), those of small ones down
+/// to half of it.
 pub fn paint(
     material: Material,
     [width, height]: [f32; 2],
@@ -493,7 +495,9 @@ pub fn paint(
     richness: f32,
     rng: &mut ChaCha8Rng,
 ) -> Texture {
-    let texel = ((width * height).sqrt() / 700.0).clamp(0.5 * texel, texel);
+    const MAX_TEXELS: f32 = 16e6;
+    let side = (width * height).sqrt();
+    let texel = (side / 700.0).clamp(0.5 * texel, texel).max(side / MAX_TEXELS.sqrt());
     let columns = (width / texel).ceil().max(1.0) as usize;
     let rows = (height / texel).ceil().max(1.0) as usize;
     let mut canvas = Canvas::new(columns, rows, texel, [128.0; 3]);

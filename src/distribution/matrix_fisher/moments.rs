@@ -6,6 +6,20 @@ use super::{InvalidSingularValues, check_singular_values};
 
 /// Normalizing constant and all moments up to order three of `Q = U^T R V ~ M(S)`, from one pass.
 ///
+/// Largest errors measured against 80-digit arithmetic on 264 triples with `s1, s2, |s3|` from
+/// 1e-6 to 1e8, both signs of `s3`, repetitions and opposites included:
+///
+/// | quantity | largest error |
+/// | --- | --- |
+/// | `log_c_scaled`, absolute | 5.4e-15 |
+/// | `complement`, relative | 6.0e-14 |
+/// | `first`, relative | 3.3e-13 |
+/// | `second`, each moment, relative | 3.6e-13 |
+/// | `third`, each moment, relative | 3.8e-13 |
+///
+/// Relative errors hold for every moment by itself, also for one that is far below its natural
+/// scale because it vanishes with a singular value. Nothing is allocated.
+///
 /// ```
 /// # use mfg_vio::distribution::matrix_fisher::Moments;
 /// # use nalgebra::Vector3;

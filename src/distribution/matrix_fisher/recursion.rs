@@ -7,6 +7,9 @@
 //! singular value decomposition fills the tables in `O(3^n)` steps, where the printed recursion
 //! visits partitions again and again.
 //!
+//! A fourth-order moment takes well below a millisecond from nothing and one of order six little
+//! more (W22 2.4.4: 0.2 s and 2 min); see `benches/distribution.rs`.
+//!
 //! It divides by differences of squared singular values: `s1, s2, |s3|` must be distinct, and
 //! digits are lost as they approach each other, the more the higher the order. For orders up to
 //! three [`Moments`](super::Moments) has neither limitation; this is the check on it, and the way
