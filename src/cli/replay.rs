@@ -15,7 +15,9 @@ use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
 use mfg_vio::viewer::Contents;
 #[cfg(feature = "viewer")]
 use mfg_vio::viewer::{Recorder, Sink};
-use mfg_vio::vision::{OrbExtractor, PinholeCamera, RgbdFrame};
+#[cfg(feature = "viewer")]
+use mfg_vio::vision::PinholeCamera;
+use mfg_vio::vision::{OrbExtractor, RgbdFrame};
 
 /// Run the estimator over a log of RGB-D frames and IMU samples.
 ///
@@ -134,6 +136,7 @@ fn load_config(args: &Args, summary: &LogSummary) -> anyhow::Result<(Config, Str
 
 /// Where a recording goes.
 #[derive(Debug, Clone)]
+#[cfg_attr(not(feature = "viewer"), expect(dead_code, reason = "targets are only refused"))]
 pub enum Target {
     File(PathBuf),
     Spawn,

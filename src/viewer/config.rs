@@ -3,6 +3,18 @@ use serde::{Deserialize, Serialize};
 #[cfg(feature = "viewer")]
 use super::ViewerError;
 
+/// What a recording is called and will hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Contents {
+    /// Name in the viewer's list, and the identity of a recording in a file: viewers merge
+    /// recordings of the same name.
+    pub name: String,
+    /// Whether there will be truth, and so errors to plot.
+    pub truth: bool,
+    /// Whether there will be IMU samples.
+    pub imu: bool,
+}
+
 /// What goes into a recording, and how often.
 ///
 /// The size of a recording is nearly all images: at 640x480 and 30 Hz about 30 to 50 kB a color

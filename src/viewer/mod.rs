@@ -38,8 +38,8 @@ mod tests;
 #[cfg(feature = "viewer")]
 mod timeline;
 
-pub use config::RecordingConfig;
+pub use config::{Contents, RecordingConfig};
 #[cfg(feature = "viewer")]
 pub use error::ViewerError;
 #[cfg(feature = "viewer")]
-pub use recorder::{Contents, Recorder, Sink};
+pub use recorder::{Recorder, Sink};

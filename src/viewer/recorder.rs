@@ -13,7 +13,7 @@ use rerun::{RecordingStream, RecordingStreamBuilder, SpawnError, SpawnOptions};
 use super::config::is_due;
 use super::scene::{self, Scene};
 use super::timeline::{Clock, FRAME, TIME};
-use super::{RecordingConfig, ViewerError, blueprint, image, plots};
+use super::{Contents, RecordingConfig, ViewerError, blueprint, image, plots};
 use crate::inertial::ImuSample;
 use crate::odometry::StepReport;
 use crate::vision::{ColorImage, DepthImage, PinholeCamera, RgbdFrame};
@@ -36,18 +36,6 @@ pub enum Sink {
     Connect(String),
     /// A viewer started for the purpose, or the one that already listens on the default port.
     Spawn,
-}
-
-/// What a recording is called and will hold.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Contents {
-    /// Name in the viewer's list, and the identity of a recording in a file: viewers merge
-    /// recordings of the same name.
-    pub name: String,
-    /// Whether there will be truth, and so errors to plot.
-    pub truth: bool,
-    /// Whether there will be IMU samples.
-    pub imu: bool,
 }
 
 /// Writes what the pipeline reports to a Rerun recording, on a thread of its own.
