@@ -27,14 +27,13 @@ impl Sums {
         Self { a, difference: a[2] - a[1] }
     }
 
-    /// `S` from its sums.
+    /// `S` from its sums, in order also where rounding would have it otherwise.
     pub fn singular_values(&self) -> nalgebra::Vector3<f64> {
         let [a1, a2, a3] = self.a;
-        nalgebra::Vector3::new(
-            0.5 * (a2 - a1) + 0.5 * a3,
-            0.5 * (a1 + self.difference),
-            0.5 * (a1 - self.difference),
-        )
+        let s1 = 0.5 * (a2 - a1) + 0.5 * a3;
+        let s2 = (0.5 * (a1 + self.difference)).min(s1);
+        let s3 = (0.5 * (a1 - self.difference)).clamp(-s2, s2);
+        nalgebra::Vector3::new(s1, s2, s3)
     }
 }
 

@@ -45,7 +45,7 @@ pub enum HigherMomentError {
 /// let moments = HigherMoments::new(&Vector3::new(25.0, 10.0, 5.0))?;
 /// // Table 2.1: E[Q23 Q32 Q12 Q23 Q31].
 /// let fifth = moments.moment(&[(1, 2), (2, 1), (0, 1), (1, 2), (2, 0)])?;
-/// assert!(fifth != 0.0 && fifth.abs() < 1e-2);
+/// assert!(fifth < 0.0);
 /// # Ok::<(), mfg_vio::distribution::matrix_fisher::HigherMomentError>(())
 /// ```
 #[derive(Debug, Clone)]

@@ -175,6 +175,34 @@ proptest! {
     }
 }
 
+/// Random points of the simplex of moments, its boundary and its ties included.
+#[test]
+fn every_admissible_moment_has_a_distribution() {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    for n in 0..1000 {
+        let mut y: [f64; 4] = std::array::from_fn(|_| match n % 3 {
+            0 => -rand::Rng::random::<f64>(&mut rng).ln(),
+            1 => 10f64.powf(rand::Rng::random_range(&mut rng, -10.0..0.0)),
+            _ => 1.0 + 10f64.powf(rand::Rng::random_range(&mut rng, -12.0..-3.0)),
+        });
+        for i in 1..4 {
+            if rand::Rng::random_range(&mut rng, 0..4) == 0 {
+                y[i] = y[i - 1];
+            }
+        }
+        y.sort_by(|a, b| b.total_cmp(a));
+        let total: f64 = y.iter().sum();
+        let target = Vector3::new(y[1], y[2], y[3]) / total;
+        let s = s_from_quaternion_squares(&target).unwrap();
+        let found = Moments::new(&s).unwrap().quaternion_squares();
+        // Sums of singular values round to the last place of the largest.
+        let tolerance = 1e-11 + 1e-15 * s[0];
+        for i in 0..3 {
+            assert!((found[i + 1] - target[i]).abs() <= tolerance * target[i], "{target} {s}");
+        }
+    }
+}
+
 #[test]
 fn derivatives_of_the_log_constant_are_the_moments() {
     let s = Vector3::new(7.0, 3.0, -1.0);
@@ -273,6 +301,8 @@ fn what_no_distribution_has_is_refused() {
     assert!(matches!(s_from_d(&Vector3::new(0.9, 0.9, 0.7)), Err(MomentError::NotAdmissible(_))));
     assert!(matches!(s_from_d(&Vector3::new(0.1, 0.2, 0.0)), Err(MomentError::NotOrdered(_))));
     assert!(matches!(s_from_d(&Vector3::repeat(f64::NAN)), Err(MomentError::NotFinite(_))));
+    let point = Vector3::new(1e-300, 1e-310, f64::MIN_POSITIVE);
+    assert!(matches!(s_from_quaternion_squares(&point), Err(MomentError::NotAdmissible(_))));
     let saddle = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0));
     let refused = MatrixFisher::from_mode_and_information(Rotation3::identity(), saddle);
     assert!(matches!(refused, Err(MatrixFisherError::NegativeInformation(_))));
