@@ -3,6 +3,7 @@
 #[cfg(feature = "vision")]
 mod demo;
 mod evaluate;
+mod experiment;
 #[cfg(feature = "vision")]
 mod replay;
 mod simulate;
@@ -32,6 +33,7 @@ enum Command {
     Replay(replay::Args),
     Simulate(simulate::SimulateArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Experiment(experiment::ExperimentArgs),
 }
 
 /// Parses the command line and runs it: exit status 0, 1 after a failure, 2 on wrong usage.
@@ -45,6 +47,7 @@ pub fn main() -> ExitCode {
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(args),
         Command::Evaluate(args) => evaluate::run(args),
+        Command::Experiment(args) => experiment::run(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

@@ -2,7 +2,6 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use statrs::distribution::{ContinuousCDF, StudentsT};
 
 use super::{EvaluationError, Statistics};
 
@@ -170,18 +169,12 @@ fn paired_test(first: &Method, second: &Method) -> Option<PairedTest> {
     let differences: Vec<f64> =
         errors(first).iter().filter_map(|(name, rmse)| Some(rmse - others.get(name)?)).collect();
     let statistics = Statistics::of(&differences)?;
-    let n = differences.len() as f64;
-    let standard_error = statistics.std / (n - 1.0).sqrt();
-    let p_value = (standard_error > 0.0 && standard_error.is_finite())
-        .then(|| StudentsT::new(0.0, 1.0, n - 1.0).ok())
-        .flatten()
-        .map(|t| 2.0 * t.sf((statistics.mean / standard_error).abs()));
     Some(PairedTest {
         first: first.name.clone(),
         second: second.name.clone(),
         runs: differences.len(),
         mean_difference: statistics.mean,
-        p_value,
+        p_value: paired_t_test(&differences),
     })
 }
 

@@ -42,7 +42,7 @@ pub use nees::{
 pub use plot::{Band, BoxPanel, Curve, CurvePanel, Figure, Panel, PathPanel, PlotError};
 pub use relative::{Delta, RpeOptions, RpeResult, rpe};
 pub use report::{Report, write_html};
-pub use statistics::Statistics;
+pub use statistics::{Statistics, paired_t_test};
 pub use sub_trajectory::{SubTrajectoryError, sub_trajectory_errors};
 pub use table::{Cell, Table};
 pub use trajectory::Trajectory;

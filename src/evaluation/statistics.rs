@@ -1,4 +1,5 @@
 use serde::{Deserialize, Serialize};
+use statrs::distribution::{ContinuousCDF, StudentsT};
 
 /// Summary of a series of errors, in the unit of the errors (`sse` in its square).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -48,6 +49,19 @@ impl Statistics {
             ("sse", self.sse),
         ]
     }
+}
+
+/// Two-sided p-value of the paired t-test that `differences` have mean zero; `None` for fewer than
+/// two of them or if they are all equal.
+pub fn paired_t_test(differences: &[f64]) -> Option<f64> {
+    let statistics = Statistics::of(differences)?;
+    let degrees = differences.len() as f64 - 1.0;
+    let standard_error = statistics.std / degrees.sqrt();
+    if !(standard_error > 0.0 && standard_error.is_finite()) {
+        return None;
+    }
+    let t = StudentsT::new(0.0, 1.0, degrees).ok()?;
+    Some(2.0 * t.sf((statistics.mean / standard_error).abs()))
 }
 
 /// Quantile `p` in [0, 1] of values in ascending order, linear between them; NaN where there are

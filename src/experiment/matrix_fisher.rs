@@ -4,10 +4,14 @@ use nalgebra::{Matrix3, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::Distribution;
+use serde::Serialize;
 
 use crate::distribution::matrix_fisher::{
     ApproximateMoments, HigherMomentError, HigherMoments, MatrixFisher, MatrixFisherError, Moments,
 };
+
+/// Chapter 2.
+pub const STUDIES: &[super::Study] = &[];
 
 /// Why a study of the matrix Fisher distribution could not be run.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -143,14 +147,14 @@ fn sample_means(
 }
 
 /// A curve of a figure.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Curve {
     pub label: &'static str,
     pub points: Vec<(f64, f64)>,
 }
 
 /// A figure as plain values; both axes are logarithmic.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Figure {
     /// The paper's number, such as `2.2`.
     pub number: &'static str,

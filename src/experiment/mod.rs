@@ -1,3 +1,22 @@
-//! The papers' numerical studies, as functions that return plain values.
+//! The papers' numerical studies: scenes x estimators x statistics.
+//!
+//! A [`Study`] is an entry of [`studies`]; it draws its runs with [`monte_carlo`] and sums them up
+//! in a [`Report`], where each figure stands beside the paper's.
 
 pub mod matrix_fisher;
+mod study;
+
+pub use matrix_fisher::{Curve, Figure};
+pub use study::{
+    Observation, PaperValue, Report, Request, Row, StepTime, Study, StudyError, Trial, monte_carlo,
+};
+
+/// Every study, in the order of `experiment --list`.
+pub fn studies() -> impl Iterator<Item = &'static Study> {
+    [matrix_fisher::STUDIES].into_iter().flatten()
+}
+
+/// The study called `name`.
+pub fn find(name: &str) -> Option<&'static Study> {
+    studies().find(|study| study.name == name)
+}

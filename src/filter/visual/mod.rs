@@ -1,14 +1,19 @@
 //! What all visual-inertial filters share: the trait, the map treatment, the point posteriors.
 
+mod mekf;
+mod mfg;
+
 use std::fmt;
 use std::str::FromStr;
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{Mekf, MfgFilter};
 use crate::alignment::{PointPair, PoseInformation, RobustKernel};
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block, symmetrize};
+
+pub use mekf::Mekf;
+pub use mfg::MfgFilter;
 
 /// What the filter assumes of map points once they are in the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, UnitQuaternion, Vector3};
 
-use super::visual::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
+use super::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
 use crate::alignment::{PointPair, PoseInformation, rotated_vector_by_rotation, vectorize};
 use crate::inertial::{Belief, ImuSample, NavCovariance, NavState, Propagator, block, symmetrize};
 

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
 
-use super::visual::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
+use super::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
 use crate::alignment::{PointPair, PoseInformation};
 use crate::inertial::{Belief, ImuSample, Propagator, block, symmetrize};
 
@@ -30,7 +30,7 @@ impl Mekf {
         let mut by_pose = SMatrix::<f64, 15, 6>::zeros();
         by_pose.fixed_columns_mut::<3>(0).copy_from(&prior.fixed_columns::<3>(block::ROTATION));
         by_pose.fixed_columns_mut::<3>(3).copy_from(&prior.fixed_columns::<3>(block::POSITION));
-        let pose = super::visual::pose_covariance(&prior);
+        let pose = super::pose_covariance(&prior);
         let inner = (Matrix6::identity() + lambda * pose).try_inverse()?;
         let correction: SVector<f64, 15> = by_pose * (inner * vector);
         let mut covariance = prior - by_pose * (inner * lambda) * by_pose.transpose();
