@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{EvaluationError, Statistics};
+use super::{EvaluationError, Statistics, paired_t_test};
 
 /// What a finished run says of itself in its `metrics.json`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
