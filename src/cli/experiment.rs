@@ -38,7 +38,7 @@ pub fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
     if args.list {
         let mut table = Table::new(["study", "runs", "what it shows"]);
         for study in experiment::studies() {
-            table.push([study.name.into(), study.runs.to_string(), study.title.into()]);
+            table.push([study.name.to_owned(), study.runs.to_string(), study.title.to_owned()]);
         }
         print!("{}", table.to_text());
         return Ok(());

@@ -68,6 +68,11 @@ impl Table {
         Self { columns: columns.map(str::to_owned).to_vec(), rows: Vec::new() }
     }
 
+    /// A row of cells of one kind.
+    pub fn push<T: Into<Cell>, const N: usize>(&mut self, row: [T; N]) {
+        self.rows.push(row.map(Into::into).into());
+    }
+
     /// Columns padded with blanks, numbers to the right.
     pub fn to_text(&self) -> String {
         let cells: Vec<Vec<String>> =
