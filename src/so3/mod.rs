@@ -14,6 +14,7 @@
 
 mod exponential;
 mod haar;
+mod polar;
 mod proper_svd;
 mod quaternion;
 
@@ -22,6 +23,7 @@ pub use exponential::{
     vee,
 };
 pub use haar::{HaarQuadrature, sample_haar};
+pub use polar::proper_polar;
 pub use proper_svd::{NotFinite, ProperSvd, project_to_so3, proper_svd};
 pub use quaternion::{
     isoclinic_decomposition, left_isoclinic, quaternion_from_rotation, quaternion_product,
