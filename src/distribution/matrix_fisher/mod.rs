@@ -59,6 +59,7 @@ mod approximation;
 mod axes;
 mod concentrated;
 mod engine;
+mod first;
 mod forms;
 mod information;
 mod mle;
@@ -78,6 +79,7 @@ use engine::Sums;
 
 pub use approximation::{ApproximateMoments, s_concentrated, s_near_uniform};
 pub use axes::canonical_axes;
+pub use first::first_complement;
 pub use mle::{
     MomentError, s_from_complement, s_from_complement_near, s_from_d, s_from_quaternion_squares,
 };
