@@ -44,6 +44,17 @@ pub trait BayesFilter: Send {
     /// The belief with its covariances, which may cost more than a step of the filter.
     fn estimate(&self) -> Estimate;
 
+    /// The mean gyro bias, rad/s, of a filter that estimates it.
+    fn gyro_bias(&self) -> Option<Vector3<f64>> {
+        None
+    }
+
+    /// Whether the filter models noise as Gaussian vectors rather than by distributions on the
+    /// sphere and on SO(3); where both descriptions of a sensor are at hand, it takes the former.
+    fn is_gaussian(&self) -> bool {
+        false
+    }
+
     /// The error of a filter that has no use for such measurements.
     fn cannot_use(&self, measurement: &'static str) -> FilterError {
         FilterError::Unsupported { filter: self.name(), measurement }

@@ -1,6 +1,7 @@
 //! Estimators: beliefs over attitude, velocity, position and biases, and how measurements
 //! change them.
 
+pub mod attitude;
 mod bayes;
 mod visual;
 

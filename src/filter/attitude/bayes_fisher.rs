@@ -1,0 +1,172 @@
+//! The first-order matrix Fisher filter (L-AMF table I) with three ways from moments to
+//! parameters and back.
+
+use nalgebra::{Matrix3, Rotation3, Vector3};
+
+use super::super::bayes::{
+    AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorMeasurement,
+};
+use super::GyroModel;
+use super::mean::PolarMean;
+use crate::distribution::matrix_fisher::{
+    MatrixFisher, MatrixFisherError, first_complement, s_concentrated, s_from_complement_near,
+    s_near_uniform,
+};
+use crate::distribution::unscented::{matrix_fisher_of_seven, mean_rotation, seven_points};
+use crate::so3::{ProperSvd, exp, proper_svd};
+
+/// Spread of the seven sigma points, `sigma` of L-UAE.
+const SEVEN_POINT_SPREAD: f64 = 0.9;
+/// Below this largest `E[Q_ii]` the near-uniform approximation applies (L-AMF section V).
+const NEAR_UNIFORM_MOMENT: f64 = 0.1;
+/// Above it the concentrated one does.
+const CONCENTRATED_MOMENT: f64 = 0.9;
+
+/// How a matrix Fisher belief and its mean determine each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MomentMap {
+    /// By the exact first moments (`bf-mfd`).
+    Exact,
+    /// As published: exact moments, and parameters by (35), (39) of L-AMF where the distribution
+    /// is broad or concentrated, after every step (`bf-amfd`).
+    Approximate,
+    /// By the mean of seven sigma points (`uae`, L-UAE proposition 3).
+    SevenPoints,
+}
+
+/// A matrix Fisher belief that is propagated by its mean and multiplied with the likelihoods of
+/// attitudes and directions, which are conjugate to it.
+#[derive(Debug, Clone, Copy)]
+pub struct BayesFisher {
+    map: MomentMap,
+    gyro: GyroModel,
+    mean: PolarMean,
+    /// Singular values at the last measurement, where the next inversion starts.
+    s: Vector3<f64>,
+}
+
+impl BayesFisher {
+    /// The filter that starts from `prior`.
+    pub fn new(
+        map: MomentMap,
+        gyro: &GyroModel,
+        prior: &MatrixFisher,
+    ) -> Result<Self, FilterError> {
+        let svd = *prior.svd();
+        Ok(Self { map, gyro: *gyro, mean: map.mean(&svd)?, s: svd.s })
+    }
+
+    /// The belief as a distribution.
+    pub fn belief(&self) -> Result<MatrixFisher, FilterError> {
+        let svd = self.map.parameter(&self.mean, &self.s)?;
+        Ok(MatrixFisher::from_svd(svd).map_err(MatrixFisherError::from)?)
+    }
+
+    /// `F + added`.
+    fn fuse(&mut self, added: &Matrix3<f64>) -> Result<(), FilterError> {
+        let prior = self.map.parameter(&self.mean, &self.s)?;
+        let posterior = proper_svd(&(prior.matrix() + added))?;
+        self.mean = self.map.mean(&posterior)?;
+        self.s = posterior.s;
+        Ok(())
+    }
+}
+
+impl MomentMap {
+    fn mean(self, fisher: &ProperSvd) -> Result<PolarMean, FilterError> {
+        let g = match self {
+            Self::Exact | Self::Approximate => {
+                first_complement(&fisher.s).map_err(MatrixFisherError::from)?
+            }
+            Self::SevenPoints => {
+                let fisher = MatrixFisher::from_svd(*fisher).map_err(MatrixFisherError::from)?;
+                let mean = mean_rotation(&seven_points(&fisher, SEVEN_POINT_SPREAD)?);
+                let svd = fisher.svd();
+                let centred = svd.u.matrix().transpose() * mean * svd.v.matrix();
+                centred.diagonal().map(|d| 1.0 - d)
+            }
+        };
+        Ok(PolarMean::from_principal(&fisher.u, &g, &fisher.v))
+    }
+
+    fn parameter(self, mean: &PolarMean, near: &Vector3<f64>) -> Result<ProperSvd, FilterError> {
+        if self == Self::SevenPoints {
+            return Ok(*matrix_fisher_of_seven(&mean.matrix(), SEVEN_POINT_SPREAD)?.svd());
+        }
+        let (u, g, v) = mean.principal();
+        let approximate = || match 1.0 - g[0] {
+            d if d < NEAR_UNIFORM_MOMENT => Some(s_near_uniform(&g.map(|g| 1.0 - g))),
+            d if d > CONCENTRATED_MOMENT => s_concentrated(&g),
+            _ => None,
+        };
+        let s = match self {
+            Self::Approximate => approximate(),
+            _ => None,
+        };
+        let s = match s {
+            Some(s) => s,
+            None => s_from_complement_near(&g, near).map_err(MatrixFisherError::from)?,
+        };
+        Ok(ProperSvd { u, s, v })
+    }
+}
+
+impl BayesFilter for BayesFisher {
+    fn name(&self) -> &'static str {
+        match self.map {
+            MomentMap::Exact => "bf-mfd",
+            MomentMap::Approximate => "bf-amfd",
+            MomentMap::SevenPoints => "uae",
+        }
+    }
+
+    fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
+        step.check()?;
+        let turn = exp(&(step.angular_velocity * step.seconds));
+        let q = self.gyro.noise * step.seconds;
+        let mean = match (self.gyro.isotropic_variance(step.seconds), self.gyro.frame) {
+            (Some(variance), _) => self.mean.diffused(variance),
+            (None, Frame::Body) => self.mean.diffused_in_body(&q)?,
+            (None, Frame::World) => self.mean.diffused_in_world(&q)?,
+        };
+        let mean = match self.gyro.frame {
+            Frame::Body => mean.turned(&turn),
+            Frame::World => mean.turned_in_world(&turn),
+        };
+        if self.map == MomentMap::Approximate {
+            let svd = self.map.parameter(&mean, &self.s)?;
+            (self.mean, self.s) = (self.map.mean(&svd)?, svd.s);
+        } else {
+            self.mean = mean;
+        }
+        Ok(())
+    }
+
+    fn update_attitude(&mut self, measured: &AttitudeMeasurement) -> Result<(), FilterError> {
+        measured.check()?;
+        self.fuse(&measured.parameter())
+    }
+
+    fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
+        let mut added = Matrix3::zeros();
+        for vector in measured {
+            added += vector.parameter()?;
+        }
+        self.fuse(&added)
+    }
+
+    fn attitude(&self) -> Rotation3<f64> {
+        self.mean.mode
+    }
+
+    fn estimate(&self) -> Estimate {
+        match self.belief() {
+            Ok(belief) => Estimate::of_matrix_fisher(&belief),
+            // A mean at the edge of what a distribution can have: the mode is still right.
+            Err(_) => Estimate::of_attitude(
+                self.mean.mode,
+                Matrix3::from_diagonal_element(super::UNIFORM_VARIANCE),
+            ),
+        }
+    }
+}

@@ -1,0 +1,174 @@
+//! The fast nonlinear filters FNF-R and FNF-L (FNF algorithms 1, 2).
+
+use nalgebra::{Matrix3, Rotation3};
+
+use super::super::bayes::{
+    AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorMeasurement,
+};
+use super::invariant::{conjugated, propagated_covariance};
+use super::{GyroModel, gaussian_covariance, information_of, symmetric};
+use crate::distribution::matrix_fisher::MatrixFisher;
+use crate::so3::{exp, hat, proper_polar};
+
+/// Concentration, relative to the others, below which an axis of the solution of Wahba's problem
+/// counts as unknown.
+const UNSOLVABLE: f64 = 1e-6;
+/// Concentration at which a belief about an axis counts as none; its covariance stays finite.
+const LEAST_INFORMATION: f64 = 1e-9;
+
+/// A matrix Fisher belief whose propagation and likelihood are those of the linearised invariant
+/// error, and whose posterior is Bayes' rule on SO(3).
+///
+/// The covariance is carried between measurements and the parameter formed only for Bayes' rule,
+/// by (31); polar decompositions, no singular values. Vectors of any length with any covariance
+/// are admissible; weights in Wahba's problem are the inverse mean variances. Where that problem
+/// has no unique solution (a single direction) the likelihood is that of the direction, as in
+/// W22 (4.14).
+#[derive(Debug, Clone, Copy)]
+pub struct FastNonlinear {
+    /// Frame of the invariant error: the world's for FNF-R, the body's for FNF-L.
+    error: Frame,
+    gyro: GyroModel,
+    mode: Rotation3<f64>,
+    /// Covariance of the error in its frame, rad^2.
+    covariance: Matrix3<f64>,
+}
+
+impl FastNonlinear {
+    /// The filter that starts from `prior` with its error in the frame `error`.
+    pub fn new(error: Frame, gyro: &GyroModel, prior: &MatrixFisher) -> Self {
+        let mode = prior.mode();
+        let in_body = covariance_of(&prior.information(), || gaussian_covariance(prior));
+        let covariance = match error {
+            Frame::World => conjugated(&mode, &in_body),
+            Frame::Body => in_body,
+        };
+        Self { error, gyro: *gyro, mode, covariance }
+    }
+
+    /// Bayes' rule with the likelihood `exp(tr(added^T R))`.
+    fn fuse(&mut self, added: &Matrix3<f64>) -> Result<(), FilterError> {
+        let n = parameter_of_covariance(&self.covariance)?;
+        let prior = match self.error {
+            Frame::World => n * self.mode.matrix(),
+            Frame::Body => self.mode.matrix() * n,
+        };
+        let (mode, k) = proper_polar(&(prior + added))?;
+        let information = information_of(&k);
+        let in_body = covariance_of(&information, || {
+            let eigen = information.symmetric_eigen();
+            let variance = eigen.eigenvalues.map(|a| a.max(LEAST_INFORMATION).recip());
+            eigen.eigenvectors * Matrix3::from_diagonal(&variance) * eigen.eigenvectors.transpose()
+        });
+        super::finite("posterior", in_body.as_slice())?;
+        self.covariance = match self.error {
+            Frame::World => conjugated(&mode, &in_body),
+            Frame::Body => in_body,
+        };
+        self.mode = mode;
+        Ok(())
+    }
+
+    /// The parameter of the likelihood of `measured` by the linearised Wahba problem, (44)/(51).
+    fn likelihood(&self, measured: &[VectorMeasurement]) -> Result<Matrix3<f64>, FilterError> {
+        let mut profile = Matrix3::zeros();
+        for m in measured {
+            m.check()?;
+            profile += m.in_world * m.in_body.transpose() * weight(m);
+        }
+        let (solution, k) = proper_polar(&profile)?;
+        let a = information_of(&k);
+        let scale = a.trace();
+        let inverse = a.try_inverse().filter(|_| a.determinant() > UNSOLVABLE * scale.powi(3));
+        let Some(inverse) = inverse else {
+            let parameters = measured.iter().map(VectorMeasurement::parameter);
+            return parameters.sum::<Result<Matrix3<f64>, _>>();
+        };
+        // In the body frame; the covariance in the world's is its conjugate.
+        let mut covariance = Matrix3::zeros();
+        for m in measured {
+            let known_in_body = match m.measured_in {
+                Frame::Body => solution.inverse_transform_vector(&m.in_world),
+                Frame::World => m.in_body,
+            };
+            let noise_in_body = match m.measured_in {
+                Frame::Body => m.covariance,
+                Frame::World => conjugated(&solution.inverse(), &m.covariance),
+            };
+            let gain = inverse * hat(&known_in_body) * weight(m);
+            covariance += gain * noise_in_body * gain.transpose();
+        }
+        Ok(solution.matrix() * parameter_of_covariance(&covariance)?)
+    }
+}
+
+fn weight(m: &VectorMeasurement) -> f64 {
+    3.0 / m.covariance.trace()
+}
+
+/// `N = tr(P^-1)/2 I - P^-1` (31).
+fn parameter_of_covariance(p: &Matrix3<f64>) -> Result<Matrix3<f64>, FilterError> {
+    let information = p.try_inverse().ok_or(FilterError::NotPositive("covariance"))?;
+    Ok(Matrix3::from_diagonal_element(0.5 * information.trace()) - symmetric(&information))
+}
+
+/// The inverse of an information matrix (30), or `fallback` where it is singular.
+fn covariance_of(
+    information: &Matrix3<f64>,
+    fallback: impl FnOnce() -> Matrix3<f64>,
+) -> Matrix3<f64> {
+    let scale = information.trace();
+    let regular = information.determinant() > LEAST_INFORMATION * scale.powi(3);
+    let inverse = information.try_inverse().filter(|_| regular && scale > LEAST_INFORMATION);
+    inverse.map_or_else(fallback, |p| symmetric(&p))
+}
+
+impl BayesFilter for FastNonlinear {
+    fn name(&self) -> &'static str {
+        match self.error {
+            Frame::World => "fnf-r",
+            Frame::Body => "fnf-l",
+        }
+    }
+
+    fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
+        step.check()?;
+        let turn = exp(&(step.angular_velocity * step.seconds));
+        let q = self.gyro.noise * step.seconds;
+        let frames = (self.error, self.gyro.frame);
+        self.covariance = propagated_covariance(&self.covariance, frames, &self.mode, &turn, &q);
+        self.mode = match self.gyro.frame {
+            Frame::Body => self.mode * turn,
+            Frame::World => turn * self.mode,
+        };
+        Ok(())
+    }
+
+    fn update_attitude(&mut self, measured: &AttitudeMeasurement) -> Result<(), FilterError> {
+        measured.check()?;
+        self.fuse(&measured.parameter())
+    }
+
+    fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
+        let added = self.likelihood(measured)?;
+        self.fuse(&added)
+    }
+
+    fn attitude(&self) -> Rotation3<f64> {
+        self.mode
+    }
+
+    fn estimate(&self) -> Estimate {
+        let in_body = match self.error {
+            Frame::World => conjugated(&self.mode.inverse(), &self.covariance),
+            Frame::Body => self.covariance,
+        };
+        let information = in_body.try_inverse();
+        let fisher =
+            information.and_then(|h| MatrixFisher::from_mode_and_information(self.mode, h).ok());
+        fisher.map_or_else(
+            || Estimate::of_attitude(self.mode, in_body),
+            |fisher| Estimate::of_matrix_fisher(&fisher),
+        )
+    }
+}

@@ -1,0 +1,144 @@
+//! The multiplicative extended Kalman filter of attitude and gyro bias.
+
+use nalgebra::{Matrix3, Matrix6, Matrix6x3, Rotation3, Vector3};
+
+use super::super::bayes::{
+    AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorEstimate,
+    VectorMeasurement,
+};
+use super::invariant::{conjugated, linearized_attitude, linearized_directions};
+use super::{AttitudePrior, GyroModel};
+use crate::so3::{exp, left_jacobian, right_jacobian};
+
+/// A Gaussian of rotation vector and bias; the rotation vector acts in the body frame (`mekf`,
+/// W22 1.3) or in the inertial frame (`mekf-i`, 1.4).
+#[derive(Debug, Clone, Copy)]
+pub struct AttitudeMekf {
+    error: Frame,
+    gyro: GyroModel,
+    attitude: Rotation3<f64>,
+    bias: Vector3<f64>,
+    /// Of (rotation vector, bias).
+    covariance: Matrix6<f64>,
+}
+
+impl AttitudeMekf {
+    /// The filter that starts from `prior` with its error in the frame `error`.
+    pub fn new(error: Frame, gyro: &GyroModel, prior: &AttitudePrior) -> Result<Self, FilterError> {
+        super::requires_body_rate(gyro)?;
+        let (attitude, in_body) = prior.gaussian()?;
+        let rotation = match error {
+            Frame::World => conjugated(&attitude, &in_body),
+            Frame::Body => in_body,
+        };
+        let covariance = joint_covariance(&rotation, &prior.gyro_bias_covariance);
+        covariance.cholesky().ok_or(FilterError::NotPositive("prior covariance"))?;
+        Ok(Self { error, gyro: *gyro, attitude, bias: prior.gyro_bias, covariance })
+    }
+
+    /// Conditions on `information e = vector` for the rotation error `e`, in Joseph's form.
+    fn correct(
+        &mut self,
+        information: &Matrix3<f64>,
+        vector: &Vector3<f64>,
+    ) -> Result<(), FilterError> {
+        let rotation = self.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        let columns = self.covariance.fixed_columns::<3>(0).into_owned();
+        let factor = (Matrix3::identity() + information * rotation).try_inverse();
+        let gain: Matrix6x3<f64> =
+            columns * factor.ok_or(FilterError::NotPositive("innovation covariance"))?;
+        let mut kept = Matrix6::identity();
+        let mut left = kept.fixed_columns_mut::<3>(0);
+        left -= gain * information;
+        let covariance =
+            kept * self.covariance * kept.transpose() + gain * information * gain.transpose();
+        let correction = gain * vector;
+        super::finite("posterior", correction.as_slice())?;
+        super::finite("posterior", covariance.as_slice())?;
+        self.covariance = 0.5 * (covariance + covariance.transpose());
+        let turn = exp(&correction.fixed_rows::<3>(0).into_owned());
+        self.attitude = match self.error {
+            Frame::World => turn * self.attitude,
+            Frame::Body => self.attitude * turn,
+        };
+        self.bias += correction.fixed_rows::<3>(3);
+        Ok(())
+    }
+}
+
+/// Rotation and bias, uncorrelated.
+pub(super) fn joint_covariance(rotation: &Matrix3<f64>, bias: &Matrix3<f64>) -> Matrix6<f64> {
+    let mut covariance = Matrix6::zeros();
+    covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(rotation);
+    covariance.fixed_view_mut::<3, 3>(3, 3).copy_from(bias);
+    covariance
+}
+
+impl BayesFilter for AttitudeMekf {
+    fn name(&self) -> &'static str {
+        match self.error {
+            Frame::World => "mekf-i",
+            Frame::Body => "mekf",
+        }
+    }
+
+    fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
+        step.check()?;
+        let h = step.seconds;
+        let angle = (step.angular_velocity - self.bias) * h;
+        let turn = exp(&angle);
+        // Body: e+ = E^T e - h J_r b - n. World: e+ = e - R (h J_l b + E n).
+        let (by_error, by_bias, q) = match self.error {
+            Frame::Body => {
+                (turn.inverse().into_inner(), right_jacobian(&angle) * -h, self.gyro.noise * h)
+            }
+            Frame::World => (
+                Matrix3::identity(),
+                self.attitude.matrix() * left_jacobian(&angle) * -h,
+                conjugated(&(self.attitude * turn), &(self.gyro.noise * h)),
+            ),
+        };
+        let mut transition = Matrix6::identity();
+        transition.fixed_view_mut::<3, 3>(0, 0).copy_from(&by_error);
+        transition.fixed_view_mut::<3, 3>(0, 3).copy_from(&by_bias);
+        let noise = joint_covariance(&q, &(self.gyro.bias_walk * h));
+        self.covariance = transition * self.covariance * transition.transpose() + noise;
+        self.attitude *= turn;
+        Ok(())
+    }
+
+    fn update_attitude(&mut self, measured: &AttitudeMeasurement) -> Result<(), FilterError> {
+        let (information, vector) = linearized_attitude(measured, self.error, &self.attitude)?;
+        self.correct(&information, &vector)
+    }
+
+    fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
+        let (information, vector) = linearized_directions(measured, self.error, &self.attitude)?;
+        self.correct(&information, &vector)
+    }
+
+    fn attitude(&self) -> Rotation3<f64> {
+        self.attitude
+    }
+
+    fn gyro_bias(&self) -> Option<Vector3<f64>> {
+        Some(self.bias)
+    }
+
+    fn is_gaussian(&self) -> bool {
+        true
+    }
+
+    fn estimate(&self) -> Estimate {
+        let rotation = self.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        let in_body = match self.error {
+            Frame::World => conjugated(&self.attitude.inverse(), &rotation),
+            Frame::Body => rotation,
+        };
+        let covariance = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        Estimate {
+            gyro_bias: Some(VectorEstimate { mean: self.bias, covariance }),
+            ..Estimate::of_attitude(self.attitude, in_body)
+        }
+    }
+}

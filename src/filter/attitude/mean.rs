@@ -1,0 +1,168 @@
+//! The mean `E[R]` of an attitude belief in polar form, and its propagation.
+//!
+//! A matrix Fisher distribution is determined by its mean. Between measurements the first-order
+//! filter changes only the mean, and linearly (L-AMF 13), so that the parameter is needed only
+//! where a measurement arrives: propagating the mean is the same filter at a fraction of the cost.
+
+use nalgebra::{Matrix3, Rotation3, SymmetricEigen, Vector3};
+
+use crate::so3::{NotFinite, ProperSvd, exp, proper_svd, vee};
+
+/// Newton steps of the polar decomposition of a matrix that is almost symmetric.
+const POLAR_STEPS: usize = 4;
+/// What a step of this size, rad, leaves behind is its square: below rounding.
+const POLAR_TOLERANCE: f64 = 1e-8;
+/// Smallest ratio of the least to the largest `d_j + d_k` for which Newton's step is used.
+const POLAR_CONDITION: f64 = 1e-2;
+
+/// `E[R] = mode (I - complement)`: `complement` is symmetric, in body coordinates, and keeps its
+/// digits where the mean is close to a rotation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct PolarMean {
+    pub mode: Rotation3<f64>,
+    pub complement: Matrix3<f64>,
+}
+
+impl PolarMean {
+    /// The mean `U (I - diag g) V^T`.
+    pub fn from_principal(u: &Rotation3<f64>, g: &Vector3<f64>, v: &Rotation3<f64>) -> Self {
+        let v_transposed = v.inverse();
+        let complement = v.matrix() * Matrix3::from_diagonal(g) * v_transposed.matrix();
+        Self { mode: u * v_transposed, complement }
+    }
+
+    /// `E[R]`.
+    pub fn matrix(&self) -> Matrix3<f64> {
+        self.mode.matrix() * (Matrix3::identity() - self.complement)
+    }
+
+    /// `(U, g, V)` with `E[R] = U (I - diag g) V^T` and `g` ascending.
+    pub fn principal(&self) -> (Rotation3<f64>, Vector3<f64>, Rotation3<f64>) {
+        let eigen = SymmetricEigen::new(self.complement);
+        let mut order = [0, 1, 2];
+        order.sort_by(|&i, &j| eigen.eigenvalues[i].total_cmp(&eigen.eigenvalues[j]));
+        let [x, y] = [order[0], order[1]].map(|i| eigen.eigenvectors.column(i).into_owned());
+        let axes = Matrix3::from_columns(&[x, y, x.cross(&y)]);
+        let v = Rotation3::from_matrix_unchecked(axes);
+        let g = Vector3::from(order.map(|i| eigen.eigenvalues[i]));
+        (self.mode * v, g, v)
+    }
+
+    /// The mean after a turn by `turn` in the body frame.
+    pub fn turned(&self, turn: &Rotation3<f64>) -> Self {
+        let complement = turn.matrix().transpose() * self.complement * turn.matrix();
+        Self { mode: self.mode * turn, complement }
+    }
+
+    /// The mean after a turn by `turn` in the world frame.
+    pub fn turned_in_world(&self, turn: &Rotation3<f64>) -> Self {
+        Self { mode: turn * self.mode, complement: self.complement }
+    }
+
+    /// The mean after isotropic diffusion of `variance` rad^2 about each axis, in any frame:
+    /// `E[R] exp(-variance)`.
+    pub fn diffused(&self, variance: f64) -> Self {
+        let kept = (-variance).exp();
+        let lost = -(-variance).exp_m1();
+        Self { mode: self.mode, complement: self.complement * kept + Matrix3::identity() * lost }
+    }
+
+    /// The mean after diffusion with the covariance `q`, rad^2, of rotation vectors in the body
+    /// frame: `E[R] (I + (q - tr(q) I)/2)`, to second order in `q` as a matrix exponential.
+    pub fn diffused_in_body(&self, q: &Matrix3<f64>) -> Result<Self, NotFinite> {
+        let loss = diffusion_loss(q);
+        Self::from_deviation(&self.mode, &(self.complement + loss - self.complement * loss))
+    }
+
+    /// The same with `q` in world coordinates.
+    pub fn diffused_in_world(&self, q: &Matrix3<f64>) -> Result<Self, NotFinite> {
+        // (I - L) M (I - C) = M (I - C - L' + L' C) with L' = M^T L M.
+        let m = self.mode.matrix();
+        let loss = m.transpose() * diffusion_loss(q) * m;
+        Self::from_deviation(&self.mode, &(self.complement + loss - loss * self.complement))
+    }
+
+    /// The polar form of `rotation (I - x)`.
+    pub fn from_deviation(rotation: &Rotation3<f64>, x: &Matrix3<f64>) -> Result<Self, NotFinite> {
+        let (mut mode, mut x) = (*rotation, *x);
+        for _ in 0..POLAR_STEPS {
+            let symmetric = Matrix3::identity() - 0.5 * (x + x.transpose());
+            let Some(turn) = polar_step(&symmetric, &-vee(&x)) else { break };
+            let rotation = exp(&turn);
+            mode *= rotation;
+            // I - exp(-turn) (I - x), without the identity that would swallow the digits of x.
+            let back = rotation.inverse();
+            x = (Matrix3::identity() - back.matrix()) + back.matrix() * x;
+            if turn.amax() < POLAR_TOLERANCE {
+                return Ok(Self { mode, complement: 0.5 * (x + x.transpose()) });
+            }
+        }
+        let ProperSvd { u, s, v } = proper_svd(&(Matrix3::identity() - x))?;
+        let centred = Self::from_principal(&u, &s.map(|d| 1.0 - d), &v);
+        Ok(Self { mode: mode * centred.mode, ..centred })
+    }
+}
+
+/// `I - E[exp(w^)]` for `w ~ N(0, q)`, to second order.
+fn diffusion_loss(q: &Matrix3<f64>) -> Matrix3<f64> {
+    let rate = 0.5 * (Matrix3::from_diagonal_element(q.trace()) - q);
+    rate - 0.5 * rate * rate
+}
+
+/// The rotation vector `e` with `e^ K + K e^ = 2 a^`: a Newton step to the polar factor of
+/// `K + a^`. `None` where the factor is close to not being unique.
+fn polar_step(k: &Matrix3<f64>, a: &Vector3<f64>) -> Option<Vector3<f64>> {
+    let curvature = Matrix3::from_diagonal_element(k.trace()) - k;
+    let factor = curvature.cholesky()?;
+    let diagonal = factor.l_dirty().diagonal();
+    (diagonal.min() > POLAR_CONDITION * diagonal.max()).then(|| factor.solve(&(2.0 * a)))
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn vector(bound: f64) -> impl Strategy<Value = Vector3<f64>> {
+        prop::array::uniform3(-bound..bound).prop_map(Vector3::from)
+    }
+
+    proptest! {
+        #[test]
+        fn polar_form_is_the_proper_polar_decomposition(
+            axes in vector(3.0),
+            g in prop::array::uniform3(0.0..1.0f64),
+            turn in vector(0.3),
+            exponent in -8.0..0.0f64,
+        ) {
+            let scale = 10f64.powf(exponent);
+            let v = exp(&axes);
+            let mut g = g;
+            g.sort_by(f64::total_cmp);
+            let g = Vector3::from(g) * scale;
+            let mean = PolarMean::from_principal(&v, &g, &v);
+            let q = exp(&turn);
+            let x = Matrix3::identity() - q.matrix() * (Matrix3::identity() - mean.complement);
+            let found = PolarMean::from_deviation(&exp(&Vector3::new(1.0, 0.0, 2.0)), &x).unwrap();
+            let expected = exp(&Vector3::new(1.0, 0.0, 2.0)) * q;
+            prop_assert!((found.complement - mean.complement).amax() < 1e-12);
+            prop_assert!((found.mode.matrix() - expected.matrix()).amax() < 1e-8);
+        }
+    }
+
+    #[test]
+    fn diffusion_is_that_of_samples_on_a_small_sphere() {
+        // E[exp(w^)] over the six points +-sqrt(3 q) e_i of equal weight, to fourth order in w.
+        let q = Vector3::new(1e-3, 4e-3, 2e-3);
+        let mut mean = Matrix3::zeros();
+        for i in 0..3 {
+            for sign in [1.0, -1.0] {
+                let w = Vector3::<f64>::ith(i, sign * (3.0f64 * q[i]).sqrt());
+                mean += exp(&w).matrix() / 6.0;
+            }
+        }
+        let loss = diffusion_loss(&Matrix3::from_diagonal(&q));
+        assert!((Matrix3::identity() - loss - mean).amax() < 2e-5);
+    }
+}
