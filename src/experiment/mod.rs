@@ -3,6 +3,7 @@
 //! A [`Study`] is an entry of [`studies`]; it draws its runs with [`monte_carlo`] and sums them up
 //! in a [`Report`], where each figure stands beside the paper's.
 
+mod attitude;
 pub mod matrix_fisher;
 mod study;
 
@@ -13,7 +14,7 @@ pub use study::{
 
 /// Every study, in the order of `experiment --list`.
 pub fn studies() -> impl Iterator<Item = &'static Study> {
-    [matrix_fisher::STUDIES].into_iter().flatten()
+    [matrix_fisher::STUDIES].into_iter().chain(attitude::STUDIES).flatten()
 }
 
 /// The study called `name`.

@@ -1,0 +1,147 @@
+//! Truth, gyroscope and measurements of the attitude studies.
+
+use nalgebra::{Matrix3, Rotation3, Vector3};
+use rand::Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+use crate::filter::{AttitudeMeasurement, InertialStep, VectorMeasurement};
+use crate::so3::{exp, log};
+
+/// What is measured at one instant, as the matrix Fisher filters and as the Gaussian filters
+/// model it: concentrations and covariances matched to the same noise.
+#[derive(Debug, Clone)]
+pub(super) enum Measured {
+    Directions { fisher: Vec<VectorMeasurement>, gaussian: Vec<VectorMeasurement> },
+    Attitude { fisher: AttitudeMeasurement, gaussian: AttitudeMeasurement },
+}
+
+impl Measured {
+    /// Directions that both model alike.
+    pub fn directions(vectors: Vec<VectorMeasurement>) -> Self {
+        Self::Directions { gaussian: vectors.clone(), fisher: vectors }
+    }
+
+    /// An attitude that both model alike.
+    pub fn attitude(measured: AttitudeMeasurement) -> Self {
+        Self::Attitude { fisher: measured, gaussian: measured }
+    }
+}
+
+/// One run: interval `k` leads to `truth[k]` and ends in `measured[k]`.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Scene {
+    pub truth: Vec<Rotation3<f64>>,
+    /// rad/s.
+    pub bias: Vec<Vector3<f64>>,
+    pub steps: Vec<InertialStep>,
+    pub measured: Vec<Option<Measured>>,
+}
+
+/// A motion known at equal intervals.
+#[derive(Debug, Clone)]
+pub(super) struct Motion {
+    /// Interval, s.
+    pub interval: f64,
+    /// At the start and after each interval.
+    pub attitudes: Vec<Rotation3<f64>>,
+    /// What an ideal gyroscope reads in each interval, rad/s, body frame.
+    pub rates: Vec<Vector3<f64>>,
+}
+
+impl Motion {
+    /// The motion `attitude(t)`; the gyroscope integrates over each interval.
+    pub fn of(interval: f64, count: usize, attitude: impl Fn(f64) -> Rotation3<f64>) -> Self {
+        let attitudes: Vec<_> = (0..=count).map(|k| attitude(k as f64 * interval)).collect();
+        let rates = mean_rates(&attitudes, interval);
+        Self { interval, attitudes, rates }
+    }
+}
+
+/// The constant rate that leads from each attitude to the next.
+fn mean_rates(attitudes: &[Rotation3<f64>], interval: f64) -> Vec<Vector3<f64>> {
+    let turns = attitudes.windows(2).map(|pair| log(&(pair[0].inverse() * pair[1])));
+    turns.map(|turn| turn / interval).collect()
+}
+
+/// The noise of a gyroscope, rad/sqrt(s) about each axis and rad/s/sqrt(s).
+#[derive(Debug, Clone, Copy)]
+pub(super) struct GyroNoise {
+    pub white: Vector3<f64>,
+    pub bias_walk: f64,
+    pub initial_bias: Vector3<f64>,
+}
+
+/// Drives a gyroscope along `motion` and measures after every `every` intervals.
+pub(super) fn simulate<R: Rng>(
+    motion: &Motion,
+    noise: &GyroNoise,
+    every: usize,
+    rng: &mut R,
+    mut measure: impl FnMut(&Rotation3<f64>, &mut R) -> Measured,
+) -> Scene {
+    let h = motion.interval;
+    let mut scene = Scene::default();
+    let mut bias = noise.initial_bias;
+    for (k, (rate, truth)) in motion.rates.iter().zip(&motion.attitudes[1..]).enumerate() {
+        let white = noise.white.component_mul(&normal(rng)) / h.sqrt();
+        scene.steps.push(InertialStep::turning(rate + bias + white, h));
+        bias += normal(rng) * (noise.bias_walk * h.sqrt());
+        scene.truth.push(*truth);
+        scene.bias.push(bias);
+        scene.measured.push(((k + 1) % every == 0).then(|| measure(truth, rng)));
+    }
+    scene
+}
+
+/// Three standard normal numbers.
+pub(super) fn normal<R: Rng>(rng: &mut R) -> Vector3<f64> {
+    Vector3::from_fn(|_, _| Distribution::<f64>::sample(&StandardNormal, rng))
+}
+
+/// The 3D pendulum of Lee, Chaturvedi, Sanyal, Leok and McClamroch (2007), the motion of L-UAE,
+/// L-AMF and FNF: an elliptic cylinder of 1 kg that hangs from a pivot 0.3 m off its centre.
+pub(super) fn pendulum(interval: f64, count: usize) -> Motion {
+    const INERTIA: [f64; 3] = [0.13, 0.28, 0.17];
+    const MASS: f64 = 1.0;
+    const ARM: f64 = 0.3;
+    const GRAVITY: f64 = 9.81;
+    /// Integration steps in each interval.
+    const SUBSTEPS: usize = 20;
+    let inertia = Vector3::from(INERTIA);
+    let acceleration = |r: &Rotation3<f64>, w: &Vector3<f64>| {
+        let gravity = r.inverse() * Vector3::z() * (MASS * GRAVITY);
+        let torque = (Vector3::z() * ARM).cross(&gravity) - w.cross(&inertia.component_mul(w));
+        torque.component_div(&inertia)
+    };
+    let (mut r, mut w) = (Rotation3::identity(), Vector3::repeat(4.14));
+    let h = interval / SUBSTEPS as f64;
+    let mut attitudes = vec![r];
+    for _ in 0..count {
+        for _ in 0..SUBSTEPS {
+            // The midpoint rule on the group: of second order, 1e-7 rad a step.
+            let middle = r * exp(&(w * (0.5 * h)));
+            let w_middle = w + acceleration(&r, &w) * (0.5 * h);
+            let next = w + acceleration(&middle, &w_middle) * h;
+            r *= exp(&(w_middle * h));
+            w = next;
+        }
+        attitudes.push(r);
+    }
+    let rates = mean_rates(&attitudes, interval);
+    Motion { interval, attitudes, rates }
+}
+
+/// The Euler angles (3-2-1) of W22 4.2.4: sinusoids at 0.35 Hz with amplitudes pi, pi/2 and pi.
+pub(super) fn tumbling(interval: f64, count: usize) -> Motion {
+    use std::f64::consts::{FRAC_PI_2, PI, TAU};
+    Motion::of(interval, count, |t| {
+        let phase = (TAU * 0.35 * t).sin();
+        let about = |axis: usize, angle: f64| exp(&Vector3::ith(axis, angle * phase));
+        about(2, PI) * about(1, FRAC_PI_2) * about(0, PI)
+    })
+}
+
+/// `diag(v)`.
+pub(super) fn diagonal(v: [f64; 3]) -> Matrix3<f64> {
+    Matrix3::from_diagonal(&Vector3::from(v))
+}
