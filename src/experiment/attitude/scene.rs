@@ -12,7 +12,7 @@ use crate::so3::{exp, log};
 #[derive(Debug, Clone)]
 pub(super) enum Measured {
     Directions { fisher: Vec<VectorMeasurement>, gaussian: Vec<VectorMeasurement> },
-    Attitude { fisher: AttitudeMeasurement, gaussian: AttitudeMeasurement },
+    Attitude { fisher: Box<AttitudeMeasurement>, gaussian: Box<AttitudeMeasurement> },
 }
 
 impl Measured {
@@ -23,7 +23,7 @@ impl Measured {
 
     /// An attitude that both model alike.
     pub fn attitude(measured: AttitudeMeasurement) -> Self {
-        Self::Attitude { fisher: measured, gaussian: measured }
+        Self::Attitude { fisher: Box::new(measured), gaussian: Box::new(measured) }
     }
 }
 
