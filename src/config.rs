@@ -10,7 +10,9 @@ use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
 use crate::odometry::{InitConfig, OdometryConfig, SearchConfig, TruthConfig};
 use crate::viewer::RecordingConfig;
-use crate::vision::{CameraConfig, DepthConfig, FeatureConfig, MatchingConfig, RansacConfig};
+use crate::vision::{
+    CameraConfig, DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig,
+};
 
 /// Everything a replay can be told, by section.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -23,6 +25,7 @@ pub struct Config {
     pub features: FeatureConfig,
     pub search: SearchConfig,
     pub matching: MatchingConfig,
+    pub patch: PatchConfig,
     pub ransac: RansacConfig,
     pub map: MapConfig,
     pub filter: FilterConfig,
@@ -88,6 +91,7 @@ impl Config {
             camera: self.camera.clone(),
             search: self.search.clone(),
             matching: self.matching.clone(),
+            patch: self.patch.clone(),
             ransac: self.ransac.clone(),
             map: self.map.clone(),
             filter: self.filter.clone(),

@@ -157,13 +157,14 @@ fn median(mut values: Vec<f64>) -> f64 {
 
 /// Correspondences of matches whose two features have depth; the earlier frame is the world.
 fn correspondences(
+    camera: &PinholeCamera,
     world: &[Feature],
     now: &[Feature],
     matches: &[Match],
 ) -> Vec<(Match, Correspondence)> {
     let pair = |m: &Match| {
-        let world = world[m.query].measurement?;
-        let measurement = now[m.train].measurement?;
+        let world = world[m.query].measurement(camera)?;
+        let measurement = now[m.train].measurement(camera)?;
         let c =
             Correspondence { measurement, world: world.point, world_covariance: world.covariance };
         Some((*m, c))
@@ -204,7 +205,7 @@ fn run(sequence: &Sequence, config: &FeatureConfig) -> Summary {
         let now = extractor.extract(frame).unwrap();
         s.extraction_ms.push(start.elapsed().as_secs_f64() * 1e3);
         s.features.push(now.len() as f64);
-        s.with_depth.push(now.iter().filter(|f| f.measurement.is_some()).count() as f64);
+        s.with_depth.push(now.iter().filter(|f| f.depth.is_some()).count() as f64);
         let mut cells = [[false; 16]; 12];
         for f in &now {
             let cell = |v: f64, n: usize| ((v / 40.0).max(0.0) as usize).min(n - 1);
@@ -222,7 +223,7 @@ fn run(sequence: &Sequence, config: &FeatureConfig) -> Summary {
         let matches = match_descriptors(&descriptors(&world), &descriptors(&now), &matching);
         s.all_ms.push(start.elapsed().as_secs_f64() * 1e3);
         let ransac = RansacConfig::default();
-        let pairs = correspondences(&world, &now, &matches);
+        let pairs = correspondences(&camera, &world, &now, &matches);
         let data: Vec<_> = pairs.iter().map(|p| p.1).collect();
         s.all_matches.push(data.len() as f64);
         let start = Instant::now();
@@ -233,7 +234,7 @@ fn run(sequence: &Sequence, config: &FeatureConfig) -> Summary {
         // As with an IMU: the rotation known, the translation zero.
         let predicted = Isometry3::from_parts(Translation3::identity(), truth.rotation);
         let prediction = |f: &Feature| {
-            let point = f.measurement.map_or(camera.unproject(f.pixel, 2.0), |m| m.point);
+            let point = f.measurement(&camera).map_or(camera.unproject(f.pixel, 2.0), |m| m.point);
             let pixel = camera.project(&predicted.inverse_transform_point(&point.into()).coords);
             Prediction { descriptor: f.descriptor, pixel: pixel.unwrap_or_default(), radius: 20.0 }
         };
@@ -241,7 +242,7 @@ fn run(sequence: &Sequence, config: &FeatureConfig) -> Summary {
         let predictions: Vec<_> = world.iter().map(prediction).collect();
         let matches = match_guided(&predictions, &now, &matching);
         s.guided_ms.push(start.elapsed().as_secs_f64() * 1e3);
-        let pairs = correspondences(&world, &now, &matches);
+        let pairs = correspondences(&camera, &world, &now, &matches);
         let data: Vec<_> = pairs.iter().map(|p| p.1).collect();
         s.guided_matches.push(data.len() as f64);
         let found = estimate_pose(&data, &camera, Some(&truth.rotation), &ransac, index as u64);

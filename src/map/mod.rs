@@ -3,10 +3,12 @@
 mod frustum;
 mod index;
 
-use nalgebra::{Isometry3, Matrix3, Vector3};
+use std::sync::Arc;
+
+use nalgebra::{Isometry3, Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::vision::{Descriptor, PinholeCamera};
+use crate::vision::{Descriptor, Patch, PinholeCamera};
 use frustum::Frustum;
 use index::SpatialIndex;
 
@@ -55,6 +57,8 @@ pub struct MapPoint {
     pub covariance: Matrix3<f64>,
     /// As last seen.
     pub descriptor: Descriptor,
+    /// What later views are aligned with.
+    pub reference: Option<ReferenceView>,
     /// Unit vector from the camera that last saw it to the point, world coordinates.
     pub view_direction: Vector3<f64>,
     /// Frame numbers.
@@ -64,14 +68,28 @@ pub struct MapPoint {
     pub observations: u32,
 }
 
+/// How a point looked from one place.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReferenceView {
+    pub patch: Arc<Patch>,
+    /// The point relative to the centre of the patch, pixels of the patch's level.
+    pub offset: Vector2<f64>,
+    /// Pixels of the full image a pixel of that level.
+    pub scale: f64,
+    /// Pose of the camera as it was believed to be.
+    pub world_from_camera: Isometry3<f64>,
+}
+
 /// A sighting of a point in one frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Sighting {
     /// Frame number.
     pub frame: u64,
     /// Position of the camera in world coordinates, m.
     pub camera: Vector3<f64>,
     pub descriptor: Descriptor,
+    /// To be kept for the alignment of later views; `None` keeps the one there is.
+    pub reference: Option<ReferenceView>,
 }
 
 /// Points in order of their ids.
@@ -125,6 +143,7 @@ impl Map {
             position,
             covariance,
             descriptor: sighting.descriptor,
+            reference: sighting.reference.clone(),
             view_direction,
             first_seen: sighting.frame,
             last_seen: sighting.frame,
@@ -144,6 +163,9 @@ impl Map {
         };
         point.view_direction = view_direction;
         point.descriptor = sighting.descriptor;
+        if sighting.reference.is_some() {
+            point.reference.clone_from(&sighting.reference);
+        }
         point.last_seen = sighting.frame;
         point.observations = point.observations.saturating_add(1);
         true
@@ -245,7 +267,7 @@ mod tests {
     }
 
     fn seen_from_origin(frame: u64) -> Sighting {
-        Sighting { frame, camera: Vector3::zeros(), descriptor: descriptor(0) }
+        Sighting { frame, camera: Vector3::zeros(), descriptor: descriptor(0), reference: None }
     }
 
     fn map_of(points: &[Vector3<f64>]) -> Map {
@@ -317,7 +339,10 @@ mod tests {
     fn observing_renews_what_a_point_looks_like() {
         let mut map = map_of(&[Vector3::z() * 2.0]);
         let camera = Vector3::new(2.0, 0.0, 2.0);
-        assert!(map.observe(0, &Sighting { frame: 7, camera, descriptor: descriptor(9) }));
+        assert!(map.observe(
+            0,
+            &Sighting { frame: 7, camera, descriptor: descriptor(9), reference: None }
+        ));
         let point = map.get(0).unwrap();
         assert_eq!((point.first_seen, point.last_seen, point.observations), (0, 7, 2));
         assert_eq!(point.descriptor, descriptor(9));

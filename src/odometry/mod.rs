@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::filter::FilterConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
-use crate::vision::{CameraConfig, MatchingConfig, RansacConfig};
+use crate::vision::{CameraConfig, MatchingConfig, PatchConfig, RansacConfig};
 
 pub use event::{Event, TruthPose};
 pub use init::{InitConfig, InitMode};
@@ -34,11 +34,13 @@ pub struct SearchConfig {
     pub max_radius: f64,
     /// With fewer matches than this the search is repeated with the largest radius.
     pub min_matches: usize,
+    /// Use matched features without depth too: they measure a direction.
+    pub without_depth: bool,
 }
 
 impl Default for SearchConfig {
     fn default() -> Self {
-        Self { min_radius: 8.0, max_radius: 120.0, min_matches: 30 }
+        Self { min_radius: 8.0, max_radius: 120.0, min_matches: 30, without_depth: true }
     }
 }
 
@@ -49,6 +51,7 @@ pub struct OdometryConfig {
     pub camera: CameraConfig,
     pub search: SearchConfig,
     pub matching: MatchingConfig,
+    pub patch: PatchConfig,
     pub ransac: RansacConfig,
     pub map: MapConfig,
     pub filter: FilterConfig,

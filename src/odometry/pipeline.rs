@@ -1,7 +1,7 @@
 use std::collections::VecDeque;
 use std::time::Instant;
 
-use nalgebra::{Isometry3, Matrix3, Point2, Point3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix2, Matrix3, Point2, Point3, UnitQuaternion, Vector2, Vector3};
 
 use super::init::{Attempt, Evidence, Initializer};
 use super::report::{
@@ -12,10 +12,10 @@ use super::{OdometryConfig, TruthPose};
 use crate::alignment::PointPair;
 use crate::filter::{FilterKind, MapTreatment, VisualInertialFilter, point_by_pose};
 use crate::inertial::{Belief, ImuSample, Propagator, Stamp};
-use crate::map::{Map, MapPoint, Sighting};
+use crate::map::{Map, MapPoint, ReferenceView, Sighting};
 use crate::vision::{
-    Correspondence, Feature, Match, PinholeCamera, PointMeasurement, Prediction, RgbdFrame,
-    estimate_pose, match_guided,
+    Correspondence, DepthReading, Feature, Match, PinholeCamera, PointMeasurement, Prediction,
+    RgbdFrame, estimate_pose, match_guided,
 };
 
 /// A frame whose features have been found.
@@ -267,8 +267,8 @@ impl Odometry {
         self.stats.imu_gaps += running.propagate_to(stamp, &mut self.imu, view.config, &mut notes);
         times.propagation = clock.lap();
 
-        let features = Features::of(&front.features);
-        let (candidates, matches) = running.find_matches(&features, &view);
+        let features = &front.features;
+        let (candidates, matches) = running.find_matches(features, &view);
         times.matching = clock.lap();
 
         let inliers = running.find_inliers(&matches, &view);
@@ -282,7 +282,7 @@ impl Odometry {
         notes.extend(running.note_tracking(innovation.is_some(), stamp));
         times.update = clock.lap();
 
-        let roles = running.grow_map(number, &features, &matches, &inliers, treatment, &view);
+        let roles = running.grow_map(number, features, &matches, &inliers, treatment, &view);
         times.map = clock.lap();
 
         self.stats.frames_processed += 1;
@@ -299,7 +299,7 @@ impl Odometry {
             innovation,
             counts: StepCounts {
                 features: front.features.len(),
-                with_depth: features.seen.len(),
+                with_depth: features.iter().filter(|f| f.depth.is_some()).count(),
                 candidates,
                 matches: matches.len(),
                 inliers: inliers.len(),
@@ -323,35 +323,17 @@ struct View<'a> {
     seed: u64,
 }
 
-/// The features of a frame, those with depth set apart.
-struct Features<'a> {
-    all: &'a [Feature],
-    /// Features with depth, in order.
-    seen: Vec<Feature>,
-    /// For each of them its index in `all` and its measurement.
-    measured: Vec<(usize, PointMeasurement)>,
-}
-
-impl<'a> Features<'a> {
-    fn of(all: &'a [Feature]) -> Self {
-        let with_depth = || all.iter().enumerate().filter(|(_, f)| f.measurement.is_some());
-        Self {
-            all,
-            seen: with_depth().map(|(_, f)| f.clone()).collect(),
-            measured: with_depth().filter_map(|(i, f)| Some((i, f.measurement?))).collect(),
-        }
-    }
-}
-
-/// A feature with depth and the map point that it looks like.
+/// A feature and the map point that it looks like.
 #[derive(Debug, Clone, Copy)]
 struct Association {
-    /// Index into `Features::seen`.
+    /// Index into the features of the frame.
     feature: usize,
     /// Id in the map.
     point: u64,
     predicted: Point2<f64>,
     correspondence: Correspondence,
+    /// Whether the present view should serve as the reference of later ones.
+    renews_reference: bool,
 }
 
 impl Running {
@@ -422,7 +404,7 @@ impl Running {
     }
 
     /// Number of map points that should be visible, and the features that look like one.
-    fn find_matches(&mut self, features: &Features, view: &View) -> (usize, Vec<Association>) {
+    fn find_matches(&mut self, features: &[Feature], view: &View) -> (usize, Vec<Association>) {
         let world_from_camera = self.world_from_camera(view);
         let ids = self.map.candidates(&world_from_camera, view.camera, view.size.0, view.size.1);
         let mut associations = self.match_candidates(&ids, features, view, false);
@@ -435,7 +417,7 @@ impl Running {
     fn match_candidates(
         &self,
         ids: &[u64],
-        features: &Features,
+        features: &[Feature],
         view: &View,
         everywhere: bool,
     ) -> Vec<Association> {
@@ -465,19 +447,21 @@ impl Running {
             .unzip();
         let associate = |m: Match| {
             let (point, prediction) = (points.get(m.query)?, predictions.get(m.query)?);
-            let (_, measurement) = features.measured.get(m.train)?;
+            let feature = features.get(m.train)?;
+            let placed = place(feature, point, &world_from_camera, view)?;
             Some(Association {
                 feature: m.train,
                 point: point.id,
                 predicted: prediction.pixel,
                 correspondence: Correspondence {
-                    measurement: *measurement,
+                    measurement: placed.measurement,
                     world: point.position,
                     world_covariance: point.covariance,
                 },
+                renews_reference: placed.renews_reference,
             })
         };
-        let matches = match_guided(&predictions, &features.seen, &view.config.matching);
+        let matches = match_guided(&predictions, features, &view.config.matching);
         matches.into_iter().filter_map(associate).collect()
     }
 
@@ -517,46 +501,141 @@ impl Running {
     }
 
     /// Renews the points seen, inserts new ones, forgets old ones. What became of each feature,
-    /// and where it was predicted, comes back in the order of `features.all`.
+    /// and where it was predicted, comes back in the order of `features`.
     fn grow_map(
         &mut self,
         number: u64,
-        features: &Features,
+        features: &[Feature],
         matches: &[Association],
         inliers: &[usize],
         treatment: MapTreatment,
         view: &View,
     ) -> Vec<(KeypointRole, Option<Point2<f64>>)> {
-        let camera = self.world_from_camera(view).translation.vector;
-        let sighting =
-            |feature: &Feature| Sighting { frame: number, camera, descriptor: feature.descriptor };
-        let mut roles = vec![(KeypointRole::NoDepth, None); features.all.len()];
-        for (index, _) in &features.measured {
-            roles[*index].0 = KeypointRole::Unmatched;
-        }
+        let world_from_camera = self.world_from_camera(view);
+        let sighting = |feature: &Feature, reference| Sighting {
+            frame: number,
+            camera: world_from_camera.translation.vector,
+            descriptor: feature.descriptor,
+            reference,
+        };
+        let unmatched = |feature: &Feature| match feature.depth {
+            Some(_) => KeypointRole::Unmatched,
+            None => KeypointRole::NoDepth,
+        };
+        let mut roles: Vec<_> = features.iter().map(|f| (unmatched(f), None)).collect();
         for (m, accepted) in matches.iter().zip(membership(inliers, matches.len())) {
-            let (index, _) = features.measured[m.feature];
             let role = if accepted { KeypointRole::Inlier } else { KeypointRole::Outlier };
-            roles[index] = (role, Some(m.predicted));
+            roles[m.feature] = (role, Some(m.predicted));
             if accepted {
-                self.map.observe(m.point, &sighting(&features.all[index]));
+                let (feature, point) = (&features[m.feature], self.map.get(m.point));
+                let reference = point
+                    .filter(|_| m.renews_reference)
+                    .and_then(|point| reference(feature, point, &world_from_camera, view));
+                self.map.observe(m.point, &sighting(feature, reference));
             }
         }
-        for (index, measurement) in &features.measured {
-            if roles[*index].0 == KeypointRole::Unmatched {
-                let (in_body, covariance) = in_body(measurement, view);
-                let estimate = self.filter.insert(treatment, &in_body, &covariance);
-                let sighting = sighting(&features.all[*index]);
-                let inserted =
-                    self.map.insert(estimate.position, estimate.covariance, &sighting).is_some();
-                if inserted {
-                    roles[*index].0 = KeypointRole::New;
-                }
+        for (feature, role) in features.iter().zip(&mut roles) {
+            if role.0 != KeypointRole::Unmatched {
+                continue;
+            }
+            let Some(measurement) = feature.measurement(view.camera) else { continue };
+            let (in_body, covariance) = in_body(&measurement, view);
+            let estimate = self.filter.insert(treatment, &in_body, &covariance);
+            let reference = first_reference(feature, &world_from_camera);
+            let sighting = sighting(feature, reference);
+            if self.map.insert(estimate.position, estimate.covariance, &sighting).is_some() {
+                role.0 = KeypointRole::New;
             }
         }
         self.map.prune(number);
         roles
     }
+}
+
+/// A matched feature as a measurement of its map point.
+struct Placed {
+    measurement: PointMeasurement,
+    renews_reference: bool,
+}
+
+/// Aligns `feature` with the reference view of `point`, where there is one, and measures it there.
+///
+/// Without depth the feature measures a direction: a point at the predicted depth, as uncertain
+/// along the ray as it is far. `None` where such features are not wanted.
+fn place(
+    feature: &Feature,
+    point: &MapPoint,
+    world_from_camera: &Isometry3<f64>,
+    view: &View,
+) -> Option<Placed> {
+    let predicted = world_from_camera.inverse_transform_point(&Point3::from(point.position)).z;
+    let direction_only =
+        DepthReading { depth: predicted, slope: Vector2::zeros(), standard_deviation: predicted };
+    let depth = match feature.depth {
+        Some(depth) => depth,
+        None if view.config.search.without_depth && predicted > 0.0 => direction_only,
+        None => return None,
+    };
+    let config = &view.config.patch;
+    let (mut shift, mut sigma) = (Vector2::zeros(), feature.pixel_sigma);
+    let mut renews_reference = true;
+    if let (true, Some(reference), Some(patch)) = (config.align, &point.reference, &feature.patch)
+        && let Some(warp) = warp(reference, feature, &depth, world_from_camera, view.camera)
+        && let Some(found) =
+            patch.align(&reference.patch, reference.offset, &warp, config.max_shift)
+        && found.correlation >= config.min_correlation
+    {
+        shift = found.shift * feature.scale;
+        sigma = config.pixel_sigma * feature.scale;
+        let change = warp.determinant().abs().sqrt();
+        renews_reference = change.max(change.recip()) > config.max_scale_change;
+    }
+    let measurement = feature.measurement_with(&depth, view.camera, shift, sigma);
+    Some(Placed { measurement, renews_reference })
+}
+
+/// Maps offsets from the feature to offsets from where the reference view saw the same surface,
+/// both in pixels of their pyramid levels, to first order.
+fn warp(
+    reference: &ReferenceView,
+    feature: &Feature,
+    depth: &DepthReading,
+    world_from_camera: &Isometry3<f64>,
+    camera: &PinholeCamera,
+) -> Option<Matrix2<f64>> {
+    /// Of the order of the window that is compared, pixels of the level.
+    const STEP: f64 = 4.0;
+    let reference_from_camera = reference.world_from_camera.inv_mul(world_from_camera);
+    let seen = |offset: Vector2<f64>| {
+        let at = camera.unproject(feature.pixel + offset, depth.depth + depth.slope.dot(&offset));
+        camera.project(&(reference_from_camera * Point3::from(at)).coords)
+    };
+    let column = |axis: Vector2<f64>| {
+        let step = axis * (STEP * feature.scale);
+        Some((seen(step)? - seen(-step)?) / (2.0 * STEP * reference.scale))
+    };
+    Some(Matrix2::from_columns(&[column(Vector2::x())?, column(Vector2::y())?]))
+}
+
+/// The view of a feature that becomes a map point.
+fn first_reference(feature: &Feature, world_from_camera: &Isometry3<f64>) -> Option<ReferenceView> {
+    let patch = feature.patch.clone()?;
+    let (offset, scale) = (Vector2::zeros(), feature.scale);
+    Some(ReferenceView { patch, offset, scale, world_from_camera: *world_from_camera })
+}
+
+/// The present view of `point`, which is where the belief has it by now.
+fn reference(
+    feature: &Feature,
+    point: &MapPoint,
+    world_from_camera: &Isometry3<f64>,
+    view: &View,
+) -> Option<ReferenceView> {
+    let in_camera = world_from_camera.inverse_transform_point(&Point3::from(point.position));
+    let offset = (view.camera.project(&in_camera.coords)? - feature.pixel) / feature.scale;
+    let near = offset.norm() <= view.config.patch.max_shift;
+    let first = first_reference(feature, world_from_camera).filter(|_| near)?;
+    Some(ReferenceView { offset, ..first })
 }
 
 /// A camera measurement in body coordinates, its covariance inflated as configured.

@@ -1,7 +1,9 @@
-use nalgebra::{Matrix3, Point2, Vector3};
+use std::sync::Arc;
+
+use nalgebra::{Matrix3, Point2, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{DepthReading, PinholeCamera};
+use super::{DepthReading, Patch, PinholeCamera};
 
 /// A 256-bit binary descriptor (ORB, BRIEF, ...).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -74,8 +76,35 @@ pub struct Feature {
     pub response: f32,
     /// Pyramid level it was found on, 0 being the full image.
     pub octave: u8,
+    /// Pixels of the full image a pixel of that level.
+    pub scale: f64,
+    /// Standard deviation of `pixel`, pixels a coordinate.
+    pub pixel_sigma: f64,
+    /// Its surroundings on that level.
+    pub patch: Option<Arc<Patch>>,
     /// `None` where the depth image has no reading that can be trusted.
-    pub measurement: Option<PointMeasurement>,
+    pub depth: Option<DepthReading>,
+}
+
+impl Feature {
+    /// Where the feature is in space, as the detector placed it; `None` without depth.
+    pub fn measurement(&self, camera: &PinholeCamera) -> Option<PointMeasurement> {
+        let depth = self.depth.as_ref()?;
+        Some(self.measurement_with(depth, camera, Vector2::zeros(), self.pixel_sigma))
+    }
+
+    /// Where the feature is in space if it is really `shift` (px of the full image) beside
+    /// [`Self::pixel`], known with `pixel_sigma` (px), on the surface that `depth` describes.
+    pub fn measurement_with(
+        &self,
+        depth: &DepthReading,
+        camera: &PinholeCamera,
+        shift: Vector2<f64>,
+        pixel_sigma: f64,
+    ) -> PointMeasurement {
+        let moved = DepthReading { depth: depth.depth + depth.slope.dot(&shift), ..*depth };
+        PointMeasurement::new(camera, self.pixel + shift, pixel_sigma, &moved)
+    }
 }
 
 /// How key points are found and how well they are localised.

@@ -232,7 +232,16 @@ mod tests {
 
     fn feature(x: f64, y: f64, descriptor: Descriptor) -> Feature {
         let pixel = Point2::new(x, y);
-        Feature { pixel, descriptor, response: 1.0, octave: 0, measurement: None }
+        Feature {
+            pixel,
+            descriptor,
+            response: 1.0,
+            octave: 0,
+            scale: 1.0,
+            pixel_sigma: 1.0,
+            patch: None,
+            depth: None,
+        }
     }
 
     fn with_bits(bits: u32) -> Descriptor {

@@ -11,6 +11,7 @@ mod image;
 mod matching;
 #[cfg(feature = "vision")]
 mod orb;
+pub mod patch;
 pub mod ransac;
 #[cfg(feature = "vision")]
 mod select;
@@ -23,4 +24,5 @@ pub use image::{ColorImage, DepthImage, PixelFormat};
 pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
 #[cfg(feature = "vision")]
 pub use orb::{OrbExtractor, VisionError};
+pub use patch::{Patch, PatchConfig};
 pub use ransac::{Correspondence, RansacConfig, estimate_pose};

@@ -1,5 +1,7 @@
 //! The front end on OpenCV: FAST corners on an image pyramid, ORB descriptors, depth.
 
+use std::sync::Arc;
+
 use nalgebra::{Point2, Vector2};
 use opencv::boxed_ref::BoxedRef;
 use opencv::core::{
@@ -14,8 +16,8 @@ use opencv::{calib3d, imgproc};
 use super::RgbdFrame;
 use super::select::{Corner, spread};
 use super::{
-    CameraConfig, DepthConfig, Descriptor, Feature, FeatureConfig, PinholeCamera, PixelFormat,
-    PointMeasurement,
+    CameraConfig, DepthConfig, Descriptor, Feature, FeatureConfig, Patch, PinholeCamera,
+    PixelFormat,
 };
 
 /// Radius of the patch that orientation and descriptor are computed from, pixels of the level.
@@ -131,7 +133,7 @@ impl OrbExtractor {
         let (cell, spacing) = (self.config.cell_size, self.config.min_spacing);
         let corners = spread(corners, color.0, color.1, cell, spacing, self.config.max_features);
         let described = self.describe(&pyramid, &corners)?;
-        self.measure(frame, &described)
+        self.measure(frame, &pyramid, &described)
     }
 
     /// The grey image and its reductions, as far as a patch fits into them.
@@ -245,32 +247,25 @@ impl OrbExtractor {
     fn measure(
         &self,
         frame: &RgbdFrame,
+        pyramid: &[Mat],
         described: &[(Corner, Descriptor)],
     ) -> Result<Vec<Feature>, VisionError> {
         let pixels = self.undistort(described.iter().map(|(corner, _)| corner.pixel))?;
-        let feature = |((corner, descriptor), pixel): (&(Corner, Descriptor), Point2<f64>)| {
-            let sigma = self.config.pixel_sigma_at(corner.level);
-            Feature {
+        let mut features = Vec::with_capacity(described.len());
+        for ((corner, descriptor), pixel) in described.iter().zip(pixels) {
+            features.push(Feature {
                 pixel,
                 descriptor: *descriptor,
                 response: corner.score,
                 octave: corner.level,
-                measurement: self.measurement(frame, corner.pixel, pixel, sigma),
-            }
-        };
-        Ok(described.iter().zip(pixels).map(feature).collect())
-    }
-
-    /// Depth is registered to the color image as taken, hence looked up at the `raw` pixel.
-    fn measurement(
-        &self,
-        frame: &RgbdFrame,
-        raw: Point2<f64>,
-        pixel: Point2<f64>,
-        sigma: f64,
-    ) -> Option<PointMeasurement> {
-        let reading = self.depth.read(&frame.depth, raw)?;
-        Some(PointMeasurement::new(&self.pinhole, pixel, sigma, &reading))
+                scale: self.config.scale_factor.powi(i32::from(corner.level)),
+                pixel_sigma: self.config.pixel_sigma_at(corner.level),
+                patch: patch_around(pyramid, corner)?,
+                // Depth is registered to the color image as taken, hence looked up at that pixel.
+                depth: self.depth.read(&frame.depth, corner.pixel),
+            });
+        }
+        Ok(features)
     }
 
     /// Pixels of the same camera without distortion.
@@ -338,6 +333,12 @@ fn grey(frame: &RgbdFrame) -> Result<Mat, VisionError> {
 fn full_pixel(level_pixel: Point2<f64>, scale: Vector2<f64>) -> Point2<f64> {
     let half = Vector2::repeat(0.5);
     Point2::from((level_pixel.coords + half).component_mul(&scale) - half)
+}
+
+fn patch_around(pyramid: &[Mat], corner: &Corner) -> Result<Option<Arc<Patch>>, VisionError> {
+    let Some(level) = pyramid.get(usize::from(corner.level)) else { return Ok(None) };
+    let patch = Patch::cut(level.data_bytes()?, level.cols() as usize, corner.column, corner.row);
+    Ok(patch.map(Arc::new))
 }
 
 /// Direction from the corner to the intensity centroid of the disc around it, degrees in
@@ -410,8 +411,7 @@ mod tests {
         for f in &features {
             assert!((0.0..WIDTH as f64).contains(&f.pixel.x));
             assert!((0.0..HEIGHT as f64).contains(&f.pixel.y));
-            let measured = f.measurement.unwrap();
-            assert!((measured.point.z - 2.0).abs() < 1e-9);
+            assert!((f.depth.unwrap().depth - 2.0).abs() < 1e-9);
         }
     }
 
