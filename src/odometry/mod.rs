@@ -40,7 +40,7 @@ pub struct SearchConfig {
 
 impl Default for SearchConfig {
     fn default() -> Self {
-        Self { min_radius: 8.0, max_radius: 120.0, min_matches: 30, without_depth: true }
+        Self { min_radius: 8.0, max_radius: 120.0, min_matches: 30, without_depth: false }
     }
 }
 

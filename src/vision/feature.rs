@@ -133,9 +133,9 @@ pub struct FeatureConfig {
 impl Default for FeatureConfig {
     fn default() -> Self {
         Self {
-            max_features: 700,
-            levels: 8,
-            scale_factor: 1.2,
+            max_features: 600,
+            levels: 4,
+            scale_factor: 1.44,
             fast_threshold: 20,
             min_fast_threshold: 7,
             cell_size: 40.0,

@@ -5,7 +5,7 @@
 //! it with what was around the same point when it entered the map is several times as exact, and
 //! it does not drift, because the reference stays the same.
 
-use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
+use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// Half the side of a stored patch, pixels of its pyramid level.
@@ -87,20 +87,43 @@ impl Patch {
         Some(Self(patch))
     }
 
-    /// Bilinear value at an offset from the centre; `None` outside.
-    fn at(&self, offset: Vector2<f32>) -> Option<f32> {
-        let place = offset.add_scalar(PATCH_RADIUS as f32);
-        // Also refuses NaN.
-        let inside = |x: f32| x >= 0.0 && x < (SIDE - 1) as f32;
-        if !(inside(place.x) && inside(place.y)) {
-            return None;
-        }
-        let (x, y) = (place.x as usize, place.y as usize);
+    /// Bilinear value at a place counted from the first pixel; the last one inside where it is
+    /// outside.
+    fn at(&self, place: Vector2<f32>) -> f32 {
+        const LAST: usize = SIDE - 2;
+        // The casts saturate.
+        let (x, y) = ((place.x as usize).min(LAST), (place.y as usize).min(LAST));
         let (fx, fy) = (place.x - x as f32, place.y - y as f32);
         let value = |x: usize, y: usize| f32::from(self.0[y][x]);
         let upper = value(x, y) + fx * (value(x + 1, y) - value(x, y));
         let lower = value(x, y + 1) + fx * (value(x + 1, y + 1) - value(x, y + 1));
-        Some(upper + fy * (lower - upper))
+        upper + fy * (lower - upper)
+    }
+
+    /// Bilinear values in the window moved by `shift` from the centre; `None` where it leaves the
+    /// patch.
+    fn window(&self, shift: Vector2<f32>) -> Option<Window> {
+        let first = shift.add_scalar((PATCH_RADIUS - WINDOW_RADIUS) as f32);
+        // Also refuses NaN.
+        let inside = |x: f32| x >= 0.0 && x < (SIDE - WINDOW) as f32;
+        if !(inside(first.x) && inside(first.y)) {
+            return None;
+        }
+        let (left, top) = (first.x as usize, first.y as usize);
+        let (fx, fy) = (first.x - left as f32, first.y - top as f32);
+        let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+        let mut values = [0.0; WINDOW * WINDOW];
+        for (y, line) in values.as_chunks_mut::<WINDOW>().0.iter_mut().enumerate() {
+            let upper = &self.0[top + y][left..=left + WINDOW];
+            let lower = &self.0[top + y + 1][left..=left + WINDOW];
+            for (x, value) in line.iter_mut().enumerate() {
+                *value = weights[0] * f32::from(upper[x])
+                    + weights[1] * f32::from(upper[x + 1])
+                    + weights[2] * f32::from(lower[x])
+                    + weights[3] * f32::from(lower[x + 1]);
+            }
+        }
+        Some(values)
     }
 
     /// Finds in this patch the point that `reference` shows at `offset` from its centre.
@@ -134,14 +157,19 @@ impl Patch {
     }
 }
 
+/// Grey values, row by row.
+type Window = [f32; WINDOW * WINDOW];
+
 /// The reference as the current view should see it, ready to be compared.
 struct Template {
-    values: [f32; WINDOW * WINDOW],
-    /// Derivatives by shift (2), gain and brightness.
-    jacobian: [SVector<f32, 4>; WINDOW * WINDOW],
-    inverse: SMatrix<f32, 4, 4>,
-    mean: f32,
-    /// Root of the sum of squared differences from the mean.
+    /// Less their mean.
+    values: Window,
+    along_x: Window,
+    along_y: Window,
+    /// Of the normal equations by shift (2) and gain; the brightness is eliminated by taking
+    /// means off.
+    inverse: Matrix3<f32>,
+    /// Root of the sum of the squared values.
     spread: f32,
 }
 
@@ -151,57 +179,76 @@ impl Template {
         offset: Vector2<f64>,
         reference_from_current: &Matrix2<f64>,
     ) -> Option<Self> {
-        let (warp, offset) = (reference_from_current.cast::<f32>(), offset.cast::<f32>());
+        const HALF: f32 = (TEMPLATE / 2) as f32;
+        let warp = reference_from_current.cast::<f32>();
+        let centre = offset.cast::<f32>().add_scalar(PATCH_RADIUS as f32);
+        // Half the sides of the box around the warped template.
+        let reach = warp.abs() * Vector2::repeat(HALF);
+        let inside = |x: f32, reach: f32| x - reach >= 0.0 && x + reach <= (SIDE - 1) as f32;
+        if !(inside(centre.x, reach.x) && inside(centre.y, reach.y)) {
+            return None;
+        }
         let mut wide = [[0.0; TEMPLATE]; TEMPLATE];
         for (y, line) in wide.iter_mut().enumerate() {
             for (x, value) in line.iter_mut().enumerate() {
-                let place =
-                    Vector2::new(x as f32, y as f32).add_scalar(-(TEMPLATE as f32 / 2.0 - 0.5));
-                *value = reference.at(offset + warp * place)?;
+                let place = Vector2::new(x as f32 - HALF, y as f32 - HALF);
+                *value = reference.at(centre + warp * place);
             }
         }
-        let mut values = [0.0; WINDOW * WINDOW];
-        for (i, value) in values.iter_mut().enumerate() {
-            *value = wide[1 + i / WINDOW][1 + i % WINDOW];
-        }
-        let mean = values.iter().sum::<f32>() / values.len() as f32;
-        let mut jacobian = [SVector::zeros(); WINDOW * WINDOW];
-        let mut normal = SMatrix::<f32, 4, 4>::zeros();
-        let mut squares = 0.0;
-        for (i, row) in jacobian.iter_mut().enumerate() {
+        let mut template = Self {
+            values: [0.0; WINDOW * WINDOW],
+            along_x: [0.0; WINDOW * WINDOW],
+            along_y: [0.0; WINDOW * WINDOW],
+            inverse: Matrix3::zeros(),
+            spread: 0.0,
+        };
+        for i in 0..WINDOW * WINDOW {
             let (x, y) = (1 + i % WINDOW, 1 + i / WINDOW);
-            let along_x = 0.5 * (wide[y][x + 1] - wide[y][x - 1]);
-            let along_y = 0.5 * (wide[y + 1][x] - wide[y - 1][x]);
-            let centred = values[i] - mean;
-            *row = SVector::<f32, 4>::new(along_x, along_y, centred, 1.0);
-            normal += *row * row.transpose();
-            squares += centred * centred;
+            template.values[i] = wide[y][x];
+            template.along_x[i] = 0.5 * (wide[y][x + 1] - wide[y][x - 1]);
+            template.along_y[i] = 0.5 * (wide[y + 1][x] - wide[y - 1][x]);
         }
-        let inverse = normal.cholesky()?.inverse();
-        Some(Self { values, jacobian, inverse, mean, spread: squares.sqrt() })
+        let rows = [&mut template.along_x, &mut template.along_y, &mut template.values];
+        rows.map(take_mean_off);
+        let rows = [&template.along_x, &template.along_y, &template.values];
+        let normal = Matrix3::from_fn(|i, j| dot(rows[i], rows[j]));
+        template.spread = normal.m33.sqrt();
+        template.inverse = normal.cholesky()?.inverse();
+        Some(template)
     }
 
     /// How far `shift` is beyond the best one, to first order, and the correlation at `shift`.
     fn step(&self, current: &Patch, shift: Vector2<f32>) -> Option<(Vector2<f32>, f32)> {
-        let mut right = SVector::<f32, 4>::zeros();
-        let (mut sum, mut squares, mut product) = (0.0, 0.0, 0.0);
-        for (i, (value, row)) in self.values.iter().zip(&self.jacobian).enumerate() {
-            let place = Vector2::new((i % WINDOW) as f32, (i / WINDOW) as f32)
-                .add_scalar(-(WINDOW_RADIUS as f32));
-            let seen = current.at(place + shift)?;
-            right += row * (seen - value);
-            sum += seen;
-            squares += seen * seen;
-            product += seen * (value - self.mean);
-        }
-        let step = self.inverse * right;
-        let spread = (squares - sum * sum / self.values.len() as f32).max(0.0).sqrt();
-        let correlation = product / (spread * self.spread).max(f32::MIN_POSITIVE);
-        // The gradients are those of the reference; where the current view has more or less
-        // contrast, so have its own.
-        let gain = (1.0 + step[2]).max(0.2);
-        step.iter().all(|x| x.is_finite()).then(|| (step.fixed_rows::<2>(0) / gain, correlation))
+        let mut seen = current.window(shift)?;
+        take_mean_off(&mut seen);
+        let product = dot(&self.values, &seen);
+        let right = Vector3::new(dot(&self.along_x, &seen), dot(&self.along_y, &seen), product);
+        // `seen = gain (values + gradient * step)`; the gradients are those of the reference, so
+        // that the step comes out as many times too long as there is more contrast.
+        let fit = self.inverse * right;
+        let gain = fit.z;
+        let correlation = product / (dot(&seen, &seen).sqrt() * self.spread);
+        let step = fit.xy() / gain;
+        let sound = gain > 0.0 && step.iter().all(|x| x.is_finite()) && correlation.is_finite();
+        sound.then_some((step, correlation))
     }
+}
+
+fn take_mean_off(values: &mut Window) {
+    let mean = values.iter().sum::<f32>() / values.len() as f32;
+    values.iter_mut().for_each(|value| *value -= mean);
+}
+
+/// In several lanes, which the compiler may not make of one sum by itself.
+fn dot(a: &Window, b: &Window) -> f32 {
+    const LANES: usize = 9;
+    let mut lanes = [0.0; LANES];
+    for (a, b) in a.as_chunks::<LANES>().0.iter().zip(b.as_chunks::<LANES>().0) {
+        for (lane, (a, b)) in lanes.iter_mut().zip(a.iter().zip(b)) {
+            *lane += a * b;
+        }
+    }
+    lanes.iter().sum()
 }
 
 #[cfg(test)]
