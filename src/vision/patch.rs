@@ -208,8 +208,9 @@ impl Template {
             template.along_x[i] = 0.5 * (wide[y][x + 1] - wide[y][x - 1]);
             template.along_y[i] = 0.5 * (wide[y + 1][x] - wide[y - 1][x]);
         }
-        let rows = [&mut template.along_x, &mut template.along_y, &mut template.values];
-        rows.map(take_mean_off);
+        for row in [&mut template.along_x, &mut template.along_y, &mut template.values] {
+            take_mean_off(row);
+        }
         let rows = [&template.along_x, &template.along_y, &template.values];
         let normal = Matrix3::from_fn(|i, j| dot(rows[i], rows[j]));
         template.spread = normal.m33.sqrt();
