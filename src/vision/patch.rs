@@ -145,7 +145,7 @@ impl Patch {
         for _ in 0..MAX_STEPS {
             let (step, correlation) = template.step(self, shift)?;
             shift -= step;
-            if !(f64::from(shift.norm()) <= max_shift) {
+            if f64::from(shift.norm()) > max_shift {
                 return None;
             }
             if step.norm() < STEP_TOLERANCE {
