@@ -210,13 +210,15 @@ impl VectorMeasurement {
     }
 }
 
-/// A measured position of the body.
+/// A measured position of a point of the body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PositionMeasurement {
     /// World coordinates, m.
     pub in_world: Vector3<f64>,
     /// World coordinates, m^2.
     pub covariance: Matrix3<f64>,
+    /// The point in body coordinates, m; zero for the body's origin.
+    pub lever_arm: Vector3<f64>,
 }
 
 /// A vector's mean and covariance.
@@ -279,6 +281,8 @@ pub enum FilterError {
     NotFinite(&'static str),
     #[error("the {0} is not positive definite")]
     NotPositive(&'static str),
+    #[error("{0} did not converge")]
+    NoConvergence(&'static str),
     #[error("a vector of length zero has no direction")]
     ZeroVector,
     #[error("this filter needs the specific force")]

@@ -250,6 +250,7 @@ fn what_cannot_be_used_is_refused_and_changes_nothing() {
         let position = crate::filter::PositionMeasurement {
             in_world: Vector3::zeros(),
             covariance: Matrix3::identity(),
+            lever_arm: Vector3::zeros(),
         };
         let refused = filter.update_position(&position).unwrap_err().to_string();
         assert!(refused.contains(kind.name()), "{refused}");
