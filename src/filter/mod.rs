@@ -3,6 +3,7 @@
 
 pub mod attitude;
 mod bayes;
+pub mod gnss;
 mod visual;
 
 pub use bayes::{

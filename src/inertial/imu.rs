@@ -20,6 +20,14 @@ impl ImuSample {
     }
 }
 
+/// A position measured by a GNSS receiver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PositionFix {
+    pub stamp: Stamp,
+    /// World coordinates (local, z up), m.
+    pub position: Vector3<f64>,
+}
+
 /// Units and noise of the IMU. Noise densities are continuous-time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

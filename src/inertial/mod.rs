@@ -7,7 +7,7 @@ mod propagation;
 mod stamp;
 mod state;
 
-pub use imu::{ImuConfig, ImuSample};
+pub use imu::{ImuConfig, ImuSample, PositionFix};
 pub use initial::{InitialAttitude, StandstillCheck, StandstillConfig, attitude_from_gravity};
 pub(crate) use propagation::symmetrize;
 pub use propagation::{MotionModel, Propagator};

@@ -69,8 +69,20 @@ impl Propagator {
         }
         let angular_velocity = (from.angular_velocity + to.angular_velocity) * 0.5;
         let specific_force = (from.specific_force + to.specific_force) * 0.5;
+        self.advance(belief, &angular_velocity, &specific_force, h)
+    }
+
+    /// Moves `belief` over `h > 0` seconds with the measured angular velocity and specific force
+    /// averaged over them; false, and no change, where no finite belief follows.
+    pub fn advance(
+        &self,
+        belief: &mut Belief,
+        angular_velocity: &Vector3<f64>,
+        specific_force: &Vector3<f64>,
+        h: f64,
+    ) -> bool {
         let mut moved = *belief;
-        self.step(&mut moved, &angular_velocity, &specific_force, h);
+        self.step(&mut moved, angular_velocity, specific_force, h);
         let finite = moved.is_finite();
         if finite {
             *belief = moved;

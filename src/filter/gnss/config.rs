@@ -1,0 +1,195 @@
+use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
+use statrs::distribution::{ChiSquared, ContinuousCDF};
+
+use super::AttitudeUpdate;
+use crate::filter::PositionMeasurement;
+use crate::inertial::ImuConfig;
+
+/// Everything an IMU-GNSS run can be told, by section.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct GnssConfig {
+    pub imu: ImuConfig,
+    pub receiver: ReceiverConfig,
+    pub start: StartConfig,
+    pub filter: GnssFilterConfig,
+    pub outage: OutageConfig,
+    pub output: OutputConfig,
+}
+
+/// The GNSS receiver and how its fixes are trusted.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ReceiverConfig {
+    /// Standard deviation of a fix along each horizontal axis, m.
+    pub horizontal_noise: f64,
+    /// Standard deviation of a fix along the vertical, m.
+    pub vertical_noise: f64,
+    /// The antenna in body coordinates, m.
+    pub lever_arm: [f64; 3],
+    /// A fix is rejected if its normalized innovation squared exceeds the chi-square bound of this
+    /// probability (3 degrees of freedom); 1 accepts every fix.
+    pub gate_probability: f64,
+    /// After so many rejections in a row fixes are accepted again, whatever their innovations, until
+    /// one passes the gate.
+    pub max_rejected: usize,
+}
+
+impl Default for ReceiverConfig {
+    fn default() -> Self {
+        Self {
+            horizontal_noise: 1.0,
+            vertical_noise: 2.0,
+            lever_arm: [0.0; 3],
+            gate_probability: 1.0,
+            max_rejected: 5,
+        }
+    }
+}
+
+impl ReceiverConfig {
+    pub(super) fn measurement(&self, position: Vector3<f64>) -> PositionMeasurement {
+        let (horizontal, vertical) = (self.horizontal_noise.powi(2), self.vertical_noise.powi(2));
+        PositionMeasurement {
+            in_world: position,
+            covariance: Matrix3::from_diagonal(&Vector3::new(horizontal, horizontal, vertical)),
+            lever_arm: Vector3::from(self.lever_arm),
+        }
+    }
+
+    /// Largest acceptable normalized innovation squared.
+    pub(super) fn gate(&self) -> f64 {
+        match ChiSquared::new(3.0) {
+            Ok(distribution) if self.gate_probability < 1.0 => {
+                distribution.inverse_cdf(self.gate_probability.max(0.0))
+            }
+            _ => f64::INFINITY,
+        }
+    }
+}
+
+/// What is known of the motion at the first fix. The position starts from that fix.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StartConfig {
+    /// Length of the window after the first fix over which the IMU is levelled, s.
+    pub window: f64,
+    /// Standard deviation of roll and pitch so found, deg.
+    pub tilt_sd: f64,
+    /// Whether `heading` is known; else every heading is as likely as any other.
+    pub heading_known: bool,
+    /// Rotation about the vertical after levelling, deg.
+    pub heading: f64,
+    /// Its standard deviation, deg.
+    pub heading_sd: f64,
+    /// Standard deviation of each component of the velocity about zero, m/s.
+    pub velocity_sd: f64,
+    /// The heading counts as converged while its standard deviation is below this, deg.
+    pub converged_heading_sd: f64,
+}
+
+impl Default for StartConfig {
+    fn default() -> Self {
+        Self {
+            window: 1.0,
+            tilt_sd: 5.0,
+            heading_known: false,
+            heading: 0.0,
+            heading_sd: 5.0,
+            velocity_sd: 10.0,
+            converged_heading_sd: 5.0,
+        }
+    }
+}
+
+/// How the matrix Fisher-Gaussian filters update the attitude.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct GnssFilterConfig {
+    /// `flow` or `sigma-points` (W22 table 5.2).
+    pub attitude_update: AttitudeUpdate,
+}
+
+/// Artificial outages: fixes in them are withheld and compared with the prediction.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct OutageConfig {
+    /// Start of the first outage after the first fix, s.
+    pub start: f64,
+    /// Length of each outage, s; 0 for none.
+    pub length: f64,
+    /// From one start to the next, s; 0 for a single outage.
+    pub period: f64,
+}
+
+impl OutageConfig {
+    /// Number of the outage in which the time `elapsed` (s) after the first fix lies.
+    pub fn index_at(&self, elapsed: f64) -> Option<usize> {
+        let since = elapsed - self.start;
+        if !(self.length > 0.0 && since >= 0.0) {
+            return None;
+        }
+        let number = if self.period > 0.0 { (since / self.period).floor() } else { 0.0 };
+        (since - number * self.period < self.length).then_some(number as usize)
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct OutputConfig {
+    /// Shortest time between two lines that are no fix, s.
+    pub interval: f64,
+}
+
+impl Default for OutputConfig {
+    fn default() -> Self {
+        Self { interval: 0.1 }
+    }
+}
+
+impl GnssConfig {
+    /// The first key whose value has no meaning, and what it must be.
+    pub(super) fn first_mistake(&self) -> Option<(&'static str, &'static str)> {
+        const POSITIVE: &str = "a finite positive number";
+        const NOT_NEGATIVE: &str = "a finite number that is not negative";
+        let positive = [
+            ("imu.gyro_bias_sd", self.imu.gyro_bias_sd),
+            ("imu.accel_bias_sd", self.imu.accel_bias_sd),
+            ("imu.max_gap", self.imu.max_gap),
+            ("receiver.horizontal_noise", self.receiver.horizontal_noise),
+            ("receiver.vertical_noise", self.receiver.vertical_noise),
+            ("start.tilt_sd", self.start.tilt_sd),
+            ("start.heading_sd", self.start.heading_sd),
+            ("start.velocity_sd", self.start.velocity_sd),
+        ];
+        let not_negative = [
+            ("imu.gyro_noise", self.imu.gyro_noise),
+            ("imu.accel_noise", self.imu.accel_noise),
+            ("imu.gyro_bias_walk", self.imu.gyro_bias_walk),
+            ("imu.accel_bias_walk", self.imu.accel_bias_walk),
+            ("receiver.gate_probability", self.receiver.gate_probability),
+            ("start.window", self.start.window),
+            ("start.converged_heading_sd", self.start.converged_heading_sd),
+            ("outage.start", self.outage.start),
+            ("outage.length", self.outage.length),
+            ("outage.period", self.outage.period),
+            ("output.interval", self.output.interval),
+        ];
+        let finite = [
+            ("imu.accelerometer_scale", self.imu.accelerometer_scale),
+            ("imu.gyroscope_scale", self.imu.gyroscope_scale),
+            ("imu.gravity", self.imu.gravity),
+            ("receiver.lever_arm", self.receiver.lever_arm.iter().sum()),
+            ("start.heading", self.start.heading),
+        ];
+        let mistakes = positive.into_iter().filter(|(_, x)| !(x.is_finite() && *x > 0.0));
+        let mistakes = mistakes.map(|(key, _)| (key, POSITIVE));
+        let negative = not_negative.into_iter().filter(|(_, x)| !(x.is_finite() && *x >= 0.0));
+        let infinite = finite.into_iter().filter(|(_, x)| !x.is_finite());
+        mistakes
+            .chain(negative.map(|(key, _)| (key, NOT_NEGATIVE)))
+            .chain(infinite.map(|(key, _)| (key, "finite")))
+            .next()
+    }
+}

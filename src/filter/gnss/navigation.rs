@@ -1,0 +1,404 @@
+//! A run over recorded IMU samples and position fixes.
+
+use std::ops::ControlFlow;
+
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+
+use super::{GnssConfig, GnssFilter, GnssFilterKind, InitialBelief, Innovation};
+use crate::filter::{FilterError, InertialStep};
+use crate::inertial::{
+    Belief, ImuConfig, ImuSample, InitialAttitude, NavState, PositionFix, Stamp, block,
+};
+
+/// Why a run cannot start or go on.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum NavigationError {
+    #[error("`{key}` must be {expected}")]
+    Config { key: &'static str, expected: &'static str },
+    #[error("stamps of {what} must increase, but {later} follows {earlier}")]
+    Order { what: &'static str, earlier: Stamp, later: Stamp },
+    /// No fix lies within the IMU samples.
+    #[error(
+        "no fix lies between IMU samples that are at most {max_gap} s apart (`imu.max_gap`): \
+         {imu} IMU samples from {} to {}, {fixes} fixes from {} to {}",
+        .imu_range[0], .imu_range[1], .fix_range[0], .fix_range[1]
+    )]
+    NoStart { max_gap: f64, imu: usize, fixes: usize, imu_range: [Stamp; 2], fix_range: [Stamp; 2] },
+    #[error("there are no IMU samples or no fixes")]
+    Empty,
+    #[error("the specific force after the first fix at {0} has no direction: free fall?")]
+    Level(Stamp),
+    #[error("at {stamp}: {source}")]
+    Step { stamp: Stamp, source: FilterError },
+}
+
+/// What became of a fix.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FixUse {
+    Used,
+    /// Outside the gate.
+    Rejected,
+    /// Withheld, in the outage of this number.
+    Outage(usize),
+}
+
+/// A fix beside its prediction.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FixReport {
+    pub fate: FixUse,
+    pub innovation: Innovation,
+}
+
+/// The belief at one time; after the update at a fix.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NavigationStep {
+    pub stamp: Stamp,
+    pub belief: Belief,
+    /// `S` of the attitude's matrix Fisher distribution.
+    pub concentration: Option<Vector3<f64>>,
+    pub fix: Option<FixReport>,
+}
+
+impl NavigationStep {
+    /// Standard deviation of the rotation error about the vertical, rad.
+    pub fn heading_sd(&self) -> f64 {
+        let up = self.belief.state.world_from_body.rotation.inverse() * Vector3::z();
+        let covariance = &self.belief.covariance;
+        let rotation = covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION);
+        up.dot(&(rotation * up)).max(0.0).sqrt()
+    }
+}
+
+/// Position error during one outage: distances of withheld fixes from their predictions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OutageReport {
+    /// Of the first withheld fix, s after the first fix.
+    pub start: f64,
+    pub fixes: usize,
+    /// Root mean square, m.
+    pub rms: f64,
+    pub max: f64,
+    /// At the last withheld fix, m.
+    pub last: f64,
+}
+
+/// What a run amounts to.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct NavigationSummary {
+    pub start: Stamp,
+    pub imu_samples: usize,
+    /// Intervals between samples longer than `imu.max_gap` since the start.
+    pub gaps: usize,
+    pub used: usize,
+    pub rejected: usize,
+    /// Normalized innovations squared of fixes that were used, and the time of each after the
+    /// first fix, s.
+    pub nis: Vec<(f64, f64)>,
+    /// From when on the heading has been known to `start.converged_heading_sd`, s after the first
+    /// fix.
+    pub heading_converged: Option<f64>,
+    pub outages: Vec<OutageReport>,
+}
+
+/// Longest step of the propagation: its error is of second order in the turn during a step. s
+const MAX_STEP: f64 = 0.05;
+/// Standard deviation of the position before the first fix, m.
+const UNKNOWN_POSITION_SD: f64 = 1e4;
+
+/// Runs a filter from the first fix that lies within the IMU samples to the last sample; samples
+/// between two stamps are interpolated. `observe` ends the run early by breaking.
+pub fn navigate(
+    kind: GnssFilterKind,
+    config: &GnssConfig,
+    imu: &[ImuSample],
+    fixes: &[PositionFix],
+    mut observe: impl FnMut(&NavigationStep) -> ControlFlow<()>,
+) -> Result<NavigationSummary, NavigationError> {
+    if let Some((key, expected)) = config.first_mistake() {
+        return Err(NavigationError::Config { key, expected });
+    }
+    check_order("IMU samples", imu.iter().map(|sample| sample.stamp))?;
+    check_order("fixes", fixes.iter().map(|fix| fix.stamp))?;
+    let Start { origin, samples, fixes } = find_start(&config.imu, imu, fixes)?;
+    let (mut run, first) = Run::start(kind, config, &origin, samples, &fixes[0])?;
+    let mut waiting = fixes[1..].iter().peekable();
+    let mut now = origin;
+    if observe(&first).is_break() {
+        return Ok(run.finish());
+    }
+    for sample in samples {
+        let sample = scaled(&config.imu, sample);
+        run.count(&now, &sample);
+        while let Some(fix) = waiting.next_if(|fix| fix.stamp <= sample.stamp) {
+            let at_fix = interpolate(&now, &sample, fix.stamp);
+            run.advance(&now, &at_fix)?;
+            now = at_fix;
+            if observe(&run.fix(fix)?).is_break() {
+                return Ok(run.finish());
+            }
+        }
+        run.advance(&now, &sample)?;
+        now = sample;
+        if let Some(step) = run.due(now.stamp)
+            && observe(&step).is_break()
+        {
+            break;
+        }
+    }
+    Ok(run.finish())
+}
+
+fn check_order(
+    what: &'static str,
+    mut stamps: impl Iterator<Item = Stamp>,
+) -> Result<(), NavigationError> {
+    let Some(mut earlier) = stamps.next() else { return Err(NavigationError::Empty) };
+    for later in stamps {
+        if later <= earlier {
+            return Err(NavigationError::Order { what, earlier, later });
+        }
+        earlier = later;
+    }
+    Ok(())
+}
+
+/// Where a run begins.
+struct Start<'a> {
+    /// The IMU at the first fix.
+    origin: ImuSample,
+    /// Samples after it.
+    samples: &'a [ImuSample],
+    /// The first fix and those after it; not empty.
+    fixes: &'a [PositionFix],
+}
+
+fn find_start<'a>(
+    config: &ImuConfig,
+    imu: &'a [ImuSample],
+    fixes: &'a [PositionFix],
+) -> Result<Start<'a>, NavigationError> {
+    for (number, fix) in fixes.iter().enumerate() {
+        let after = imu.partition_point(|sample| sample.stamp <= fix.stamp);
+        let (Some(before), Some(next)) = (imu[..after].last(), imu.get(after)) else { continue };
+        if next.stamp.seconds_since(before.stamp) <= config.max_gap {
+            let origin = interpolate(&scaled(config, before), &scaled(config, next), fix.stamp);
+            return Ok(Start { origin, samples: &imu[after..], fixes: &fixes[number..] });
+        }
+    }
+    let (Some(first), Some(last)) = (imu.first(), imu.last()) else {
+        return Err(NavigationError::Empty);
+    };
+    let (Some(first_fix), Some(last_fix)) = (fixes.first(), fixes.last()) else {
+        return Err(NavigationError::Empty);
+    };
+    Err(NavigationError::NoStart {
+        max_gap: config.max_gap,
+        imu: imu.len(),
+        fixes: fixes.len(),
+        imu_range: [first.stamp, last.stamp],
+        fix_range: [first_fix.stamp, last_fix.stamp],
+    })
+}
+
+fn scaled(config: &ImuConfig, sample: &ImuSample) -> ImuSample {
+    ImuSample {
+        stamp: sample.stamp,
+        angular_velocity: sample.angular_velocity * config.gyroscope_scale,
+        specific_force: sample.specific_force * config.accelerometer_scale,
+    }
+}
+
+/// The IMU at a stamp between two samples.
+fn interpolate(a: &ImuSample, b: &ImuSample, stamp: Stamp) -> ImuSample {
+    let length = b.stamp.seconds_since(a.stamp);
+    let share = if length > 0.0 { stamp.seconds_since(a.stamp) / length } else { 0.0 };
+    ImuSample {
+        stamp,
+        angular_velocity: a.angular_velocity.lerp(&b.angular_velocity, share),
+        specific_force: a.specific_force.lerp(&b.specific_force, share),
+    }
+}
+
+struct Run<'a> {
+    config: &'a GnssConfig,
+    filter: Box<dyn GnssFilter>,
+    gate: f64,
+    rejected_in_a_row: usize,
+    /// From a fix that was used although it is outside the gate to the first one inside.
+    reacquiring: bool,
+    last_output: Stamp,
+    outages: OutageErrors,
+    summary: NavigationSummary,
+}
+
+impl<'a> Run<'a> {
+    /// A run that starts with a fix, and its first step.
+    fn start(
+        kind: GnssFilterKind,
+        config: &'a GnssConfig,
+        origin: &ImuSample,
+        samples: &[ImuSample],
+        fix: &PositionFix,
+    ) -> Result<(Self, NavigationStep), NavigationError> {
+        let at = |source| NavigationError::Step { stamp: fix.stamp, source };
+        let initial = initial_belief(config, origin, samples, fix)?;
+        let method = config.filter.attitude_update;
+        let mut filter = kind.start(&config.imu, method, &initial).map_err(at)?;
+        let position = config.receiver.measurement(fix.position);
+        filter.update_position(&position).map_err(at)?;
+        let mut run = Self {
+            config,
+            filter,
+            gate: config.receiver.gate(),
+            rejected_in_a_row: 0,
+            reacquiring: false,
+            last_output: fix.stamp,
+            outages: OutageErrors::default(),
+            summary: NavigationSummary { start: fix.stamp, used: 1, ..Default::default() },
+        };
+        let step = run.step(fix.stamp, None);
+        Ok((run, step))
+    }
+
+    fn count(&mut self, from: &ImuSample, to: &ImuSample) {
+        self.summary.imu_samples += 1;
+        if to.stamp.seconds_since(from.stamp) > self.config.imu.max_gap {
+            self.summary.gaps += 1;
+        }
+    }
+
+    fn advance(&mut self, from: &ImuSample, to: &ImuSample) -> Result<(), NavigationError> {
+        let seconds = to.stamp.seconds_since(from.stamp);
+        let steps = (seconds / MAX_STEP).ceil();
+        let step = InertialStep {
+            seconds: seconds / steps,
+            angular_velocity: (from.angular_velocity + to.angular_velocity) * 0.5,
+            specific_force: Some((from.specific_force + to.specific_force) * 0.5),
+        };
+        for _ in 0..steps as usize {
+            self.filter
+                .propagate(&step)
+                .map_err(|source| NavigationError::Step { stamp: to.stamp, source })?;
+        }
+        Ok(())
+    }
+
+    /// Uses a fix, or compares it with the prediction.
+    fn fix(&mut self, fix: &PositionFix) -> Result<NavigationStep, NavigationError> {
+        let at = |source| NavigationError::Step { stamp: fix.stamp, source };
+        let elapsed = fix.stamp.seconds_since(self.summary.start);
+        let position = self.config.receiver.measurement(fix.position);
+        let innovation = self.filter.innovation(&position).map_err(at)?;
+        let fate = if let Some(number) = self.config.outage.index_at(elapsed) {
+            self.outages.add(number, elapsed, innovation.residual.norm());
+            FixUse::Outage(number)
+        } else if innovation.nis > self.gate && self.may_reject() {
+            self.rejected_in_a_row += 1;
+            self.summary.rejected += 1;
+            FixUse::Rejected
+        } else {
+            self.filter.update_position(&position).map_err(at)?;
+            self.rejected_in_a_row = 0;
+            self.reacquiring = innovation.nis > self.gate;
+            self.summary.used += 1;
+            self.summary.nis.push((elapsed, innovation.nis));
+            FixUse::Used
+        };
+        Ok(self.step(fix.stamp, Some(FixReport { fate, innovation })))
+    }
+
+    fn may_reject(&self) -> bool {
+        !self.reacquiring && self.rejected_in_a_row < self.config.receiver.max_rejected
+    }
+
+    /// The belief, if the last one is old enough.
+    fn due(&mut self, stamp: Stamp) -> Option<NavigationStep> {
+        let age = stamp.seconds_since(self.last_output);
+        (age >= self.config.output.interval && age > 0.0).then(|| self.step(stamp, None))
+    }
+
+    fn step(&mut self, stamp: Stamp, fix: Option<FixReport>) -> NavigationStep {
+        self.last_output = stamp;
+        let step = NavigationStep {
+            stamp,
+            belief: self.filter.belief(),
+            concentration: self.filter.estimate().matrix_fisher_s,
+            fix,
+        };
+        let known = step.heading_sd().to_degrees() <= self.config.start.converged_heading_sd;
+        let since = self.summary.heading_converged.take();
+        if known {
+            let elapsed = stamp.seconds_since(self.summary.start);
+            self.summary.heading_converged = since.or(Some(elapsed));
+        }
+        step
+    }
+
+    fn finish(mut self) -> NavigationSummary {
+        self.summary.outages = self.outages.reports();
+        self.summary
+    }
+}
+
+/// Levels the IMU over the window after the first fix.
+fn initial_belief(
+    config: &GnssConfig,
+    origin: &ImuSample,
+    samples: &[ImuSample],
+    fix: &PositionFix,
+) -> Result<InitialBelief, NavigationError> {
+    let start = &config.start;
+    let in_window =
+        samples.iter().take_while(|s| s.stamp.seconds_since(origin.stamp) <= start.window);
+    let window: Vec<ImuSample> =
+        std::iter::once(*origin).chain(in_window.map(|s| scaled(&config.imu, s))).collect();
+    let (tilt_sd, heading_sd) = (start.tilt_sd.to_radians(), start.heading_sd.to_radians());
+    let level = InitialAttitude::level(&window, Vector3::zeros(), tilt_sd, heading_sd)
+        .ok_or(NavigationError::Level(fix.stamp))?;
+    let heading = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), start.heading.to_radians());
+    let rotation = if start.heading_known { heading } else { UnitQuaternion::identity() };
+    Ok(InitialBelief {
+        state: NavState {
+            world_from_body: Isometry3::from_parts(
+                fix.position.into(),
+                rotation * level.world_from_body,
+            ),
+            velocity: Vector3::zeros(),
+            gyro_bias: Vector3::zeros(),
+            accel_bias: Vector3::zeros(),
+        },
+        tilt_sd,
+        heading_sd: start.heading_known.then_some(heading_sd),
+        velocity_sd: start.velocity_sd,
+        position_sd: UNKNOWN_POSITION_SD,
+        gyro_bias_sd: config.imu.gyro_bias_sd,
+        accel_bias_sd: config.imu.accel_bias_sd,
+    })
+}
+
+/// Distances of withheld fixes from their predictions, by outage.
+#[derive(Default)]
+struct OutageErrors {
+    /// Number of the outage, start, distances.
+    outages: Vec<(usize, f64, Vec<f64>)>,
+}
+
+impl OutageErrors {
+    fn add(&mut self, number: usize, elapsed: f64, distance: f64) {
+        match self.outages.last_mut() {
+            Some((last, _, distances)) if *last == number => distances.push(distance),
+            _ => self.outages.push((number, elapsed, vec![distance])),
+        }
+    }
+
+    fn reports(&self) -> Vec<OutageReport> {
+        let report = |(_, start, distances): &(usize, f64, Vec<f64>)| OutageReport {
+            start: *start,
+            fixes: distances.len(),
+            rms: (distances.iter().map(|d| d * d).sum::<f64>() / distances.len() as f64).sqrt(),
+            max: distances.iter().copied().fold(0.0, f64::max),
+            last: distances.last().copied().unwrap_or_default(),
+        };
+        self.outages.iter().map(report).collect()
+    }
+}
