@@ -2,10 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::LogConfig;
 use crate::filter::FilterConfig;
+use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
 use crate::odometry::{InitConfig, OdometryConfig, SearchConfig, TruthConfig};
@@ -43,6 +45,9 @@ const SHIPPED: [(&str, &str); 4] = [
     ("sim", include_str!("../configs/sim.toml")),
 ];
 
+/// The configuration of `gnss` where none is given.
+const GNSS: &str = include_str!("../configs/kitti.toml");
+
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     #[error("{path}: {source}")]
@@ -74,14 +79,12 @@ impl Config {
             .iter()
             .find(|(shipped, _)| *shipped == name)
             .ok_or_else(|| ConfigError::NotShipped { name: name.to_owned() })?;
-        Self::parse(text, &format!("configs/{name}.toml"), overrides)
+        parse(text, &format!("configs/{name}.toml"), overrides)
     }
 
     /// Reads `path` and applies `overrides` (`section.key=value`).
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| ConfigError::Io { path: path.to_owned(), source })?;
-        Self::parse(&text, &path.display().to_string(), overrides)
+        parse(&read(path)?, &path.display().to_string(), overrides)
     }
 
     /// The sections that the pipeline behind the front end needs.
@@ -100,34 +103,52 @@ impl Config {
             truth: self.truth.clone(),
         }
     }
+}
 
-    fn parse(text: &str, origin: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let mut table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
-            ConfigError::Syntax { origin: origin.to_owned(), message: error.to_string() }
-        })?;
-        let valid = valid_keys()?;
-        check_keys(&table, &valid, origin)?;
-        for text in overrides {
-            apply(&mut table, text, &valid)?;
-        }
-        Self::from_table(table, origin)
+impl GnssConfig {
+    /// `configs/kitti.toml`, with `overrides` (`section.key=value`).
+    pub fn shipped(overrides: &[String]) -> Result<Self, ConfigError> {
+        parse(GNSS, "configs/kitti.toml", overrides)
     }
 
-    fn from_table(table: toml::Table, origin: &str) -> Result<Self, ConfigError> {
-        serde_path_to_error::deserialize(toml::Value::Table(table)).map_err(|error| {
-            ConfigError::BadValue {
-                origin: origin.to_owned(),
-                key: error.path().to_string(),
-                message: error.inner().to_string().trim().to_owned(),
-            }
-        })
+    /// Reads `path` and applies `overrides` (`section.key=value`).
+    pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        parse(&read(path)?, &path.display().to_string(), overrides)
     }
 }
 
+fn read(path: &Path) -> Result<String, ConfigError> {
+    std::fs::read_to_string(path)
+        .map_err(|source| ConfigError::Io { path: path.to_owned(), source })
+}
+
+/// A configuration of this type from TOML; keys that are not given have their defaults.
+fn parse<T>(text: &str, origin: &str, overrides: &[String]) -> Result<T, ConfigError>
+where
+    T: Default + Serialize + DeserializeOwned,
+{
+    let mut table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
+        ConfigError::Syntax { origin: origin.to_owned(), message: error.to_string() }
+    })?;
+    let valid = valid_keys::<T>()?;
+    check_keys(&table, &valid, origin)?;
+    for text in overrides {
+        apply(&mut table, text, &valid)?;
+    }
+    serde_path_to_error::deserialize(toml::Value::Table(table)).map_err(|error| {
+        ConfigError::BadValue {
+            origin: origin.to_owned(),
+            key: error.path().to_string(),
+            message: error.inner().to_string().trim().to_owned(),
+        }
+    })
+}
+
 /// Every `section.key` there is, from the defaults.
-fn valid_keys() -> Result<Vec<String>, ConfigError> {
-    let defaults = toml::Table::try_from(Config::default()).map_err(|error| {
-        ConfigError::Syntax { origin: "defaults".to_owned(), message: error.to_string() }
+fn valid_keys<T: Default + Serialize>() -> Result<Vec<String>, ConfigError> {
+    let defaults = toml::Table::try_from(T::default()).map_err(|error| ConfigError::Syntax {
+        origin: "defaults".to_owned(),
+        message: error.to_string(),
     })?;
     Ok(flat_keys(&defaults))
 }
@@ -186,13 +207,16 @@ mod tests {
 
     #[test]
     fn every_shipped_file_is_valid_and_names_every_key() {
-        let valid = valid_keys().unwrap();
+        let valid = valid_keys::<Config>().unwrap();
         for (name, text) in SHIPPED {
             Config::shipped(name, &[]).unwrap();
             let given = flat_keys(&text.parse().unwrap());
             let missing: Vec<_> = valid.iter().filter(|key| !given.contains(key)).collect();
             assert!(missing.is_empty(), "{name}: {missing:?}");
         }
+        GnssConfig::shipped(&[]).unwrap();
+        let given = flat_keys(&GNSS.parse().unwrap());
+        assert_eq!(given.len(), valid_keys::<GnssConfig>().unwrap().len(), "{given:?}");
     }
 
     #[test]

@@ -4,6 +4,7 @@
 mod demo;
 mod evaluate;
 mod experiment;
+mod gnss;
 #[cfg(feature = "vision")]
 mod replay;
 mod simulate;
@@ -34,6 +35,7 @@ enum Command {
     Simulate(simulate::SimulateArgs),
     Evaluate(evaluate::EvaluateArgs),
     Experiment(experiment::ExperimentArgs),
+    Gnss(gnss::GnssArgs),
 }
 
 /// Parses the command line and runs it: exit status 0, 1 after a failure, 2 on wrong usage.
@@ -48,6 +50,7 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Experiment(args) => experiment::run(&args),
+        Command::Gnss(args) => gnss::run(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,

@@ -10,6 +10,7 @@ mod folder;
 mod mcap_file;
 mod merge;
 mod message;
+mod navigation_csv;
 mod open;
 mod pair;
 mod pixels;
@@ -25,5 +26,6 @@ use crate::odometry::{Event, TruthPose};
 use crate::vision::RgbdFrame;
 
 pub use event::{Log, LogConfig, LogError, LogSummary, ReadReport};
+pub use navigation_csv::{TableError, read_imu_table, read_position_table};
 pub use open::{detect, open};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

@@ -1,6 +1,7 @@
 //! One replay from a log to its files and figures: the library behind `replay` and `demo`.
 
 mod metrics;
+mod navigation;
 mod outputs;
 mod report;
 
@@ -12,6 +13,7 @@ use std::time::Instant;
 use nalgebra::Isometry3;
 
 pub use metrics::{Evaluation, Metrics, StageSummary};
+pub use navigation::NavigationOutputs;
 pub use outputs::state_columns;
 pub use report::{Series, report};
 

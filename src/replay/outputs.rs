@@ -4,8 +4,10 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use nalgebra::{Isometry3, Vector3};
+
 use super::ReplayError;
-use crate::inertial::block;
+use crate::inertial::{NavCovariance, NavState, Stamp, block};
 use crate::odometry::{MapPointView, StepReport};
 
 /// Writes trajectory and state line by line, so that an interrupted run leaves valid files.
@@ -15,25 +17,25 @@ pub struct Outputs {
     directory: PathBuf,
 }
 
-struct OutputFile {
+pub(super) struct OutputFile {
     path: PathBuf,
     writer: BufWriter<File>,
 }
 
 impl OutputFile {
-    fn create(path: PathBuf) -> Result<Self, ReplayError> {
+    pub(super) fn create(path: PathBuf) -> Result<Self, ReplayError> {
         match File::create(&path) {
             Ok(file) => Ok(Self { path, writer: BufWriter::new(file) }),
             Err(source) => Err(ReplayError::Write { path, source }),
         }
     }
 
-    fn line(&mut self, line: &str) -> Result<(), ReplayError> {
+    pub(super) fn line(&mut self, line: &str) -> Result<(), ReplayError> {
         writeln!(self.writer, "{line}")
             .map_err(|source| ReplayError::Write { path: self.path.clone(), source })
     }
 
-    fn finish(mut self) -> Result<(), ReplayError> {
+    pub(super) fn finish(mut self) -> Result<(), ReplayError> {
         self.writer.flush().map_err(|source| ReplayError::Write { path: self.path, source })
     }
 }
@@ -50,7 +52,7 @@ impl Outputs {
     }
 
     pub fn step(&mut self, report: &StepReport) -> Result<(), ReplayError> {
-        self.trajectory.line(&trajectory_line(report))?;
+        self.trajectory.line(&trajectory_line(report.stamp, &report.state.world_from_body))?;
         self.state.line(&state_line(report))
     }
 
@@ -62,10 +64,8 @@ impl Outputs {
 }
 
 /// `timestamp tx ty tz qx qy qz qw` of the body.
-fn trajectory_line(report: &StepReport) -> String {
-    let pose = &report.state.world_from_body;
+pub(super) fn trajectory_line(stamp: Stamp, pose: &Isometry3<f64>) -> String {
     let (t, q) = (pose.translation.vector, pose.rotation.coords);
-    let stamp = report.stamp;
     format!("{stamp} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9}", t.x, t.y, t.z, q.x, q.y, q.z, q.w)
 }
 
@@ -89,6 +89,19 @@ const POSE: [usize; 6] = [
 
 /// Names of the columns of `state.csv`, in order; see `docs` of the command for their meaning.
 pub fn state_columns() -> Vec<String> {
+    let mut columns = belief_columns();
+    columns.push("innovation".to_owned());
+    columns.extend(
+        ["features", "with_depth", "candidates", "matches", "inliers", "new_points", "map_points"]
+            .map(str::to_owned),
+    );
+    let stages = crate::odometry::StageTimes::default().stages();
+    columns.extend(stages.map(|(stage, _)| format!("time_{stage}")));
+    columns
+}
+
+/// The columns of any filter's belief: stamp, state, covariances and `S`.
+pub(super) fn belief_columns() -> Vec<String> {
     let axes = |stem: &str| AXES.map(|axis| format!("{stem}_{axis}")).to_vec();
     let mut columns = vec!["time".to_owned()];
     columns.extend(["px", "py", "pz", "qx", "qy", "qz", "qw"].map(str::to_owned));
@@ -101,19 +114,30 @@ pub fn state_columns() -> Vec<String> {
     for row in 0..6 {
         columns.extend((0..6).map(|column| format!("cov_pose_{row}{column}")));
     }
-    columns.extend(["s1", "s2", "s3", "innovation"].map(str::to_owned));
-    columns.extend(
-        ["features", "with_depth", "candidates", "matches", "inliers", "new_points", "map_points"]
-            .map(str::to_owned),
-    );
-    let stages = crate::odometry::StageTimes::default().stages();
-    columns.extend(stages.map(|(stage, _)| format!("time_{stage}")));
+    columns.extend(["s1", "s2", "s3"].map(str::to_owned));
     columns
 }
 
 /// One line of `state.csv`; a value that a filter does not have is left empty.
 fn state_line(report: &StepReport) -> String {
-    let state = &report.state;
+    let s = report.matrix_fisher_s;
+    let mut fields = belief_fields(report.stamp, &report.state, &report.covariance, s);
+    fields.push(optional_field(report.innovation));
+    let c = &report.counts;
+    let counts =
+        [c.features, c.with_depth, c.candidates, c.matches, c.inliers, c.new_points, c.map_points];
+    fields.extend(counts.map(|count| count.to_string()));
+    fields.extend(report.times.stages().map(|(_, seconds)| format!("{seconds:.6}")));
+    fields.join(",")
+}
+
+/// The values of [`belief_columns`].
+pub(super) fn belief_fields(
+    stamp: Stamp,
+    state: &NavState,
+    covariance: &NavCovariance,
+    matrix_fisher_s: Option<Vector3<f64>>,
+) -> Vec<String> {
     let pose = &state.world_from_body;
     let mut values = Vec::with_capacity(96);
     values.extend(pose.translation.vector.iter().chain(pose.rotation.coords.iter()));
@@ -121,22 +145,19 @@ fn state_line(report: &StepReport) -> String {
         values.extend(vector.iter());
     }
     for (_, start) in COVARIANCE_BLOCKS {
-        values.extend((start..start + 3).map(|k| report.covariance[(k, k)]));
+        values.extend((start..start + 3).map(|k| covariance[(k, k)]));
     }
     for row in POSE {
-        values.extend(POSE.map(|column| report.covariance[(row, column)]));
+        values.extend(POSE.map(|column| covariance[(row, column)]));
     }
-    let mut fields = vec![report.stamp.to_string()];
+    let mut fields = vec![stamp.to_string()];
     fields.extend(values.iter().map(|value| format!("{value:.9e}")));
-    let s = report.matrix_fisher_s;
-    let optional = (0..3).map(|k| s.map(|s| s[k])).chain([report.innovation]);
-    fields.extend(optional.map(|v| v.map(|v| format!("{v:.9e}")).unwrap_or_default()));
-    let c = &report.counts;
-    let counts =
-        [c.features, c.with_depth, c.candidates, c.matches, c.inliers, c.new_points, c.map_points];
-    fields.extend(counts.map(|count| count.to_string()));
-    fields.extend(report.times.stages().map(|(_, seconds)| format!("{seconds:.6}")));
-    fields.join(",")
+    fields.extend((0..3).map(|k| optional_field(matrix_fisher_s.map(|s| s[k]))));
+    fields
+}
+
+fn optional_field(value: Option<f64>) -> String {
+    value.map(|v| format!("{v:.9e}")).unwrap_or_default()
 }
 
 /// ASCII PLY of the map points: position (m, world), `sigma` (m), `age` (frames).

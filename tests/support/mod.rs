@@ -1,5 +1,8 @@
 //! What the integration tests share: the program, a small simulated log, the real recordings.
 
+// Each test program uses a part of it.
+#![allow(dead_code)]
+
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
@@ -16,6 +19,14 @@ pub fn succeed(arguments: &[&str]) -> String {
     let errors = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{arguments:?}: {errors}");
     String::from_utf8(output.stdout).expect("output is UTF-8")
+}
+
+/// Its standard error, after checking that it failed at run time.
+pub fn fail(arguments: &[&str]) -> String {
+    let output = mfg_vio(arguments);
+    assert_eq!(output.status.code(), Some(1), "{arguments:?}");
+    assert!(output.stdout.is_empty(), "{arguments:?}");
+    String::from_utf8(output.stderr).expect("messages are UTF-8")
 }
 
 /// The JSON object that is all of its standard output.
