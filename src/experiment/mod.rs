@@ -4,6 +4,7 @@
 //! in a [`Report`], where each figure stands beside the paper's.
 
 mod attitude;
+mod gnss;
 pub mod matrix_fisher;
 mod study;
 
@@ -14,7 +15,8 @@ pub use study::{
 
 /// Every study, in the order of `experiment --list`.
 pub fn studies() -> impl Iterator<Item = &'static Study> {
-    [matrix_fisher::STUDIES].into_iter().chain(attitude::STUDIES).flatten()
+    let studies = [matrix_fisher::STUDIES, gnss::STUDIES];
+    studies.into_iter().chain(attitude::STUDIES).flatten()
 }
 
 /// The study called `name`.
