@@ -12,7 +12,7 @@ use mfg_vio::filter::FilterKind;
 use mfg_vio::inertial::ImuSample;
 use mfg_vio::odometry::{InitMode, StepReport};
 use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
-use mfg_vio::viewer::Contents;
+use mfg_vio::viewer::{Contents, Purpose};
 #[cfg(feature = "viewer")]
 use mfg_vio::viewer::{Recorder, Sink};
 #[cfg(feature = "viewer")]
@@ -79,6 +79,10 @@ pub struct Settings {
     /// 1: everything on one thread; more: stages overlap. Results are the same.
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=64))]
     threads: u32,
+    /// What the recording opens with: overview, uncertainty or timing [default: recording.blueprint
+    /// of the configuration].
+    #[arg(long, value_name = "NAME")]
+    blueprint: Option<Purpose>,
     /// Override a key of the configuration, e.g. --set imu.gyro_noise=1e-3 (repeatable).
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
@@ -180,6 +184,9 @@ impl Plan<'_> {
     pub fn execute(mut self) -> anyhow::Result<Replayed> {
         if let Some(mode) = self.settings.init {
             self.config.init.mode = mode;
+        }
+        if let Some(purpose) = self.settings.blueprint {
+            self.config.recording.blueprint = purpose;
         }
         if let Some(out) = &self.out {
             std::fs::create_dir_all(out).with_context(|| format!("{}", out.display()))?;

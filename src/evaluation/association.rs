@@ -3,9 +3,23 @@ use serde::Serialize;
 
 use super::{EvaluationError, Trajectory, guards};
 
+/// How a pose finds its counterpart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AssociationRule {
+    /// Each pose of the trajectory with fewer poses takes the nearest of the other: `evo`.
+    #[default]
+    Nearest,
+    /// Each pose of the estimate takes the nearest of the reference poses that come after those
+    /// already taken: OpenVINS (`AlignUtils::perform_association`). Of two estimates with the
+    /// same stamp the second gets the next reference pose; `evo`'s V102 has four such pairs.
+    OpenVins,
+}
+
 /// Which poses belong together.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct AssociationOptions {
+    pub rule: AssociationRule,
     /// Poses further apart in time than this are no pair, s.
     pub max_diff: f64,
     /// Added to the stamps of the estimate before they are compared, s.
@@ -14,7 +28,7 @@ pub struct AssociationOptions {
 
 impl Default for AssociationOptions {
     fn default() -> Self {
-        Self { max_diff: 0.01, time_offset: 0.0 }
+        Self { rule: AssociationRule::Nearest, max_diff: 0.01, time_offset: 0.0 }
     }
 }
 
@@ -47,8 +61,9 @@ impl PosePairs {
 /// Fewer pairs than this are no trajectory.
 pub(super) const MIN_MATCHES: usize = 3;
 
-/// Pairs each pose of the trajectory with fewer poses with the nearest in time of the other, if
-/// that is within the tolerance; the earlier of two that are equally near.
+/// Pairs poses by time. The default pairs each pose of the trajectory with fewer poses with the
+/// nearest of the other, if that is within the tolerance; the earlier of two that are equally
+/// near.
 ///
 /// The same rule, in the same arithmetic, as `evo` 1.38. Linear in the number of poses.
 pub fn associate(
@@ -78,7 +93,7 @@ pub(super) fn matches(
     estimate: &Trajectory,
     options: &AssociationOptions,
 ) -> Result<Vec<(usize, usize)>, EvaluationError> {
-    let AssociationOptions { max_diff, time_offset } = *options;
+    let AssociationOptions { rule, max_diff, time_offset } = *options;
     if !(max_diff >= 0.0 && max_diff.is_finite()) {
         let (name, expected) = ("max-diff", "finite and not negative");
         return Err(EvaluationError::Option { name, expected, value: max_diff });
@@ -86,6 +101,14 @@ pub(super) fn matches(
     if !time_offset.is_finite() {
         let (name, expected) = ("time-offset", "finite");
         return Err(EvaluationError::Option { name, expected, value: time_offset });
+    }
+    if rule == AssociationRule::OpenVins {
+        return Ok(in_the_manner_of_openvins(
+            reference.stamps(),
+            estimate.stamps(),
+            time_offset,
+            max_diff,
+        ));
     }
     let estimate_is_longer = estimate.len() > reference.len();
     let (shorter, longer, offset) = if estimate_is_longer {
@@ -124,6 +147,31 @@ fn nearest(
     })
 }
 
+/// Indices into (reference, estimate), by [`AssociationRule::OpenVins`].
+fn in_the_manner_of_openvins(
+    reference: &[f64],
+    estimate: &[f64],
+    offset: f64,
+    max_diff: f64,
+) -> Vec<(usize, usize)> {
+    let mut next = 0;
+    let partner = |stamp: f64| {
+        let distance =
+            |index: usize| reference.get(index).map(|other| (other - stamp, (other - stamp).abs()));
+        while distance(next).is_some_and(|(signed, d)| signed < 0.0 && d > max_diff) {
+            next += 1;
+        }
+        let (mut best, mut nearest) = (max_diff, None);
+        while let Some((_, d)) = distance(next).filter(|(_, d)| *d <= max_diff && *d < best) {
+            (best, nearest) = (d, Some(next));
+            next += 1;
+        }
+        nearest
+    };
+    let partners: Vec<_> = estimate.iter().map(|stamp| stamp + offset).map(partner).collect();
+    partners.into_iter().zip(0..).filter_map(|(r, e)| Some((r?, e))).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -139,7 +187,7 @@ mod tests {
         max_diff: f64,
         time_offset: f64,
     ) -> Vec<(usize, usize)> {
-        let options = AssociationOptions { max_diff, time_offset };
+        let options = AssociationOptions { max_diff, time_offset, ..Default::default() };
         matches(&still(reference), &still(estimate), &options).unwrap()
     }
 
@@ -164,6 +212,20 @@ mod tests {
         let reference = still(&[0.0, 0.1, 5.0]);
         let pairs = associate(&reference, &still(&[0.2, 0.3, 4.9]), &options).unwrap();
         assert_eq!((pairs.len(), pairs.shared), (3, 1));
+    }
+
+    #[test]
+    fn openvins_lets_a_reference_pose_serve_once() {
+        let (reference, estimate) = ([0.0, 0.005, 0.01, 0.015], [0.005, 0.005, 0.012, 0.5]);
+        let pairs = |rule, time_offset: f64| {
+            let options = AssociationOptions { rule, max_diff: 0.02, time_offset };
+            let moved: Vec<f64> = estimate.iter().map(|t| t - time_offset).collect();
+            matches(&still(&reference), &still(&moved), &options).unwrap()
+        };
+        for offset in [0.0, 3.0] {
+            assert_eq!(pairs(AssociationRule::Nearest, offset), [(1, 0), (1, 1), (2, 2)]);
+            assert_eq!(pairs(AssociationRule::OpenVins, offset), [(1, 0), (2, 1), (3, 2)]);
+        }
     }
 
     #[test]

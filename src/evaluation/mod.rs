@@ -27,7 +27,7 @@ mod trajectory_file;
 
 pub use absolute::{ApeOptions, ApeResult, Relation, absolute_errors, ape, ape_of_pairs};
 pub use align::{Alignment, Similarity, align};
-pub use association::{AssociationOptions, PosePairs, associate};
+pub use association::{AssociationOptions, AssociationRule, PosePairs, associate};
 pub use clock::{ClockOffset, estimate_clock_offset};
 pub use compare::{Comparison, Method, PairedTest, Run, compare};
 pub use error::EvaluationError;
@@ -36,6 +36,7 @@ pub use figures::{
     stage_times_figure, trajectory_figure,
 };
 pub use guards::{Convention, Suspicion, Which, similarity_scale, suspicions};
+pub(crate) use nees::normalised_square;
 pub use nees::{
     BelievedTrajectory, NeesOptions, NeesResult, NeesSummary, nees, read_believed_trajectory,
 };

@@ -278,7 +278,7 @@ impl Series {
 }
 
 /// `e^T P^-1 e`; `None` unless `P` is positive definite.
-fn normalised_square<const N: usize>(
+pub(crate) fn normalised_square<const N: usize>(
     error: &SVector<f64, N>,
     covariance: SMatrix<f64, N, N>,
 ) -> Option<f64> {
@@ -311,6 +311,7 @@ impl NeesSummary {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::evaluation::AssociationRule;
     use approx::assert_relative_eq;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
@@ -343,7 +344,11 @@ mod tests {
     }
 
     const SAME_WORLD: NeesOptions = NeesOptions {
-        association: AssociationOptions { max_diff: 0.01, time_offset: 0.0 },
+        association: AssociationOptions {
+            rule: AssociationRule::Nearest,
+            max_diff: 0.01,
+            time_offset: 0.0,
+        },
         alignment: Alignment::None,
         align_n: None,
         confidence: 0.95,

@@ -12,5 +12,5 @@ pub use bayes::{
 };
 pub use visual::{
     FilterConfig, FilterKind, MapEstimate, MapTreatment, Mekf, MfgFilter, UpdateOutcome,
-    VisualInertialFilter, point_by_pose,
+    VisualInertialFilter, point_by_pose, pose_covariance,
 };

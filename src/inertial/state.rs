@@ -1,5 +1,7 @@
 use nalgebra::{Isometry3, SMatrix, Vector3};
 
+use crate::distribution::matrix_fisher::MatrixFisher;
+
 /// Covariance of (rotation, velocity, position, gyro bias, accelerometer bias): the rotation
 /// error is the rotation vector `e` of `R_true = R_est exp(e^)` (body frame, rad), velocity
 /// (m/s) and position (m) are in world coordinates, biases (rad/s, m/s^2) in the body's.
@@ -47,5 +49,47 @@ pub struct Belief {
 impl Belief {
     pub fn is_finite(&self) -> bool {
         self.state.is_finite() && self.covariance.iter().all(|x| x.is_finite())
+    }
+
+    /// The matrix Fisher distribution with the same mode and the same curvature there as the
+    /// Gaussian of the rotation error: `F = M (tr(H)/2 I - H)` with `H` its inverse covariance.
+    /// `None` if that covariance is not positive definite.
+    pub fn attitude(&self) -> Option<MatrixFisher> {
+        let mode = self.state.world_from_body.rotation.to_rotation_matrix();
+        let rotation = self.covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION);
+        let information = rotation.into_owned().cholesky()?.inverse();
+        MatrixFisher::from_mode_and_information(mode, information).ok()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use nalgebra::{Matrix3, UnitQuaternion};
+
+    use super::*;
+
+    #[test]
+    fn the_attitude_has_the_mode_and_the_curvature_of_the_covariance() {
+        let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(0.4, -1.1, 0.7));
+        let state = NavState {
+            world_from_body: Isometry3::from_parts(Vector3::zeros().into(), rotation),
+            velocity: Vector3::zeros(),
+            gyro_bias: Vector3::zeros(),
+            accel_bias: Vector3::zeros(),
+        };
+        let root = Matrix3::new(0.01, 0.0, 0.0, 0.004, 0.02, 0.0, -0.003, 0.001, 0.1);
+        let mut covariance = NavCovariance::identity();
+        covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&(root * root.transpose()));
+        let mut belief = Belief { state, covariance };
+        let attitude = belief.attitude().unwrap();
+        assert!(attitude.mode().angle_to(&rotation.to_rotation_matrix()) < 1e-9);
+        assert_relative_eq!(
+            attitude.information() * root * root.transpose(),
+            Matrix3::identity(),
+            epsilon = 1e-9
+        );
+        belief.covariance.fixed_view_mut::<3, 3>(0, 0).fill(0.0);
+        assert!(belief.attitude().is_none());
     }
 }

@@ -282,20 +282,20 @@ impl Odometry {
         notes.extend(running.note_tracking(innovation.is_some(), stamp));
         times.update = clock.lap();
 
-        let roles = running.grow_map(number, features, &matches, &inliers, treatment, &view);
+        let fates = running.grow_map(number, features, &matches, &inliers, treatment, &view);
         times.map = clock.lap();
 
         self.stats.frames_processed += 1;
         let wants_map = self.map_every > 0 && number.is_multiple_of(self.map_every);
         let belief = running.filter.belief();
-        let count = |role| roles.iter().filter(|(r, _)| *r == role).count();
+        let count = |role| fates.iter().filter(|fate| fate.role == role).count();
         Some(StepReport {
             frame: number,
             stamp: front.frame.stamp,
             state: belief.state,
             covariance: belief.covariance,
             world_from_camera: belief.state.world_from_body * self.body_from_camera,
-            matrix_fisher_s: running.filter.matrix_fisher_s(),
+            matrix_fisher: running.filter.matrix_fisher(),
             innovation,
             counts: StepCounts {
                 features: front.features.len(),
@@ -307,7 +307,7 @@ impl Odometry {
                 map_points: running.map.len(),
             },
             times,
-            keypoints: keypoint_views(&front.features, &roles),
+            keypoints: keypoint_views(&front.features, &fates),
             map: wants_map.then(|| map_views(&running.map, number)),
             notes,
         })
@@ -334,6 +334,20 @@ struct Association {
     correspondence: Correspondence,
     /// Whether the present view should serve as the reference of later ones.
     renews_reference: bool,
+}
+
+/// What became of a feature.
+#[derive(Debug, Clone, Copy)]
+struct Fate {
+    role: KeypointRole,
+    /// Id of the map point it was matched to, and where that was predicted.
+    matched: Option<(u64, Point2<f64>)>,
+}
+
+impl Fate {
+    fn of(role: KeypointRole) -> Self {
+        Self { role, matched: None }
+    }
 }
 
 impl Running {
@@ -500,8 +514,8 @@ impl Running {
         Some(outcome.innovation)
     }
 
-    /// Renews the points seen, inserts new ones, forgets old ones. What became of each feature,
-    /// and where it was predicted, comes back in the order of `features`.
+    /// Renews the points seen, inserts new ones, forgets old ones. What became of each feature
+    /// comes back in the order of `features`.
     fn grow_map(
         &mut self,
         number: u64,
@@ -510,7 +524,7 @@ impl Running {
         inliers: &[usize],
         treatment: MapTreatment,
         view: &View,
-    ) -> Vec<(KeypointRole, Option<Point2<f64>>)> {
+    ) -> Vec<Fate> {
         let world_from_camera = self.world_from_camera(view);
         let sighting = |feature: &Feature, reference| Sighting {
             frame: number,
@@ -522,10 +536,10 @@ impl Running {
             Some(_) => KeypointRole::Unmatched,
             None => KeypointRole::NoDepth,
         };
-        let mut roles: Vec<_> = features.iter().map(|f| (unmatched(f), None)).collect();
+        let mut fates: Vec<_> = features.iter().map(|f| Fate::of(unmatched(f))).collect();
         for (m, accepted) in matches.iter().zip(membership(inliers, matches.len())) {
             let role = if accepted { KeypointRole::Inlier } else { KeypointRole::Outlier };
-            roles[m.feature] = (role, Some(m.predicted));
+            fates[m.feature] = Fate { role, matched: Some((m.point, m.predicted)) };
             if accepted {
                 let (feature, point) = (&features[m.feature], self.map.get(m.point));
                 let reference = point
@@ -534,8 +548,8 @@ impl Running {
                 self.map.observe(m.point, &sighting(feature, reference));
             }
         }
-        for (feature, role) in features.iter().zip(&mut roles) {
-            if role.0 != KeypointRole::Unmatched {
+        for (feature, fate) in features.iter().zip(&mut fates) {
+            if fate.role != KeypointRole::Unmatched {
                 continue;
             }
             let Some(measurement) = feature.measurement(view.camera) else { continue };
@@ -544,11 +558,11 @@ impl Running {
             let reference = first_reference(feature, &world_from_camera);
             let sighting = sighting(feature, reference);
             if self.map.insert(estimate.position, estimate.covariance, &sighting).is_some() {
-                role.0 = KeypointRole::New;
+                fate.role = KeypointRole::New;
             }
         }
         self.map.prune(number);
-        roles
+        fates
     }
 }
 
@@ -672,18 +686,16 @@ fn interpolate(from: &ImuSample, to: &ImuSample, stamp: Stamp) -> ImuSample {
     }
 }
 
-fn keypoint_views(
-    features: &[Feature],
-    roles: &[(KeypointRole, Option<Point2<f64>>)],
-) -> Vec<KeypointView> {
+fn keypoint_views(features: &[Feature], fates: &[Fate]) -> Vec<KeypointView> {
     let pixel = |p: &Point2<f64>| [p.x as f32, p.y as f32];
     features
         .iter()
-        .zip(roles)
-        .map(|(feature, (role, predicted))| KeypointView {
+        .zip(fates)
+        .map(|(feature, fate)| KeypointView {
             pixel: pixel(&feature.pixel),
-            predicted: predicted.as_ref().map(pixel),
-            role: *role,
+            predicted: fate.matched.as_ref().map(|(_, predicted)| pixel(predicted)),
+            point: fate.matched.map(|(point, _)| point),
+            role: fate.role,
         })
         .collect()
 }
@@ -691,7 +703,7 @@ fn keypoint_views(
 fn map_views(map: &Map, frame: u64) -> Vec<MapPointView> {
     let view = |point: &MapPoint| MapPointView {
         position: [point.position.x as f32, point.position.y as f32, point.position.z as f32],
-        sigma: (point.covariance.trace().max(0.0) / 3.0).sqrt() as f32,
+        covariance: point.covariance.cast(),
         age: frame.saturating_sub(point.first_seen).try_into().unwrap_or(u32::MAX),
     };
     map.points().iter().map(view).collect()

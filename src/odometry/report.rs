@@ -1,10 +1,11 @@
 //! What the pipeline tells of one camera frame: the only thing that viewers and writers see.
 
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::{Isometry3, Matrix3};
 use serde::Serialize;
 
 use crate::inertial::Stamp;
 use crate::inertial::{NavCovariance, NavState};
+use crate::so3::ProperSvd;
 
 /// What became of a key point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,6 +28,8 @@ pub struct KeypointView {
     pub pixel: [f32; 2],
     /// Where the matched map point was predicted to appear, pixels.
     pub predicted: Option<[f32; 2]>,
+    /// The map point that it was matched to.
+    pub point: Option<u64>,
     pub role: KeypointRole,
 }
 
@@ -34,10 +37,17 @@ pub struct KeypointView {
 pub struct MapPointView {
     /// World coordinates, m.
     pub position: [f32; 3],
-    /// Root of the mean variance of the position, m.
-    pub sigma: f32,
+    /// Covariance of the position, world coordinates, m^2.
+    pub covariance: Matrix3<f32>,
     /// Frames since the point was inserted.
     pub age: u32,
+}
+
+impl MapPointView {
+    /// Root of the mean variance of the position, m.
+    pub fn sigma(&self) -> f32 {
+        (self.covariance.trace().max(0.0) / 3.0).sqrt()
+    }
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
@@ -99,8 +109,8 @@ pub struct StepReport {
     pub state: NavState,
     pub covariance: NavCovariance,
     pub world_from_camera: Isometry3<f64>,
-    /// Proper singular values of the attitude's matrix Fisher part (`None` for Gaussian filters).
-    pub matrix_fisher_s: Option<Vector3<f64>>,
+    /// Parameter of the attitude's matrix Fisher part (`None` for Gaussian filters).
+    pub matrix_fisher: Option<ProperSvd>,
     /// Mean squared normalised innovation per degree of freedom; about 1 when consistent.
     pub innovation: Option<f64>,
     pub counts: StepCounts,

@@ -120,7 +120,7 @@ pub(super) fn belief_columns() -> Vec<String> {
 
 /// One line of `state.csv`; a value that a filter does not have is left empty.
 fn state_line(report: &StepReport) -> String {
-    let s = report.matrix_fisher_s;
+    let s = report.matrix_fisher.map(|svd| svd.s);
     let mut fields = belief_fields(report.stamp, &report.state, &report.covariance, s);
     fields.push(optional_field(report.innovation));
     let c = &report.counts;
@@ -171,7 +171,7 @@ fn write_map(path: &Path, map: &[MapPointView]) -> Result<(), ReplayError> {
     file.line("end_header")?;
     for point in map {
         let [x, y, z] = point.position;
-        file.line(&format!("{x} {y} {z} {} {}", point.sigma, point.age))?;
+        file.line(&format!("{x} {y} {z} {} {}", point.sigma(), point.age))?;
     }
     file.finish()
 }

@@ -1,18 +1,13 @@
-//! How a recording opens in the viewer: the world on the left, the camera on the right, plots in
-//! tabs and the log below.
-//!
-//! Written by hand, because Rerun's own builder knows neither time ranges of single entities nor
-//! properties of plots, and draws its identifiers at random.
+//! How a recording opens in the viewer: one tab for each purpose.
 
-use rerun::external::re_log_types::{BlueprintActivationCommand, StoreId, StoreKind};
-use rerun::external::re_sdk_types::View;
+use rerun::RecordingStream;
+use rerun::RecordingStreamResult;
+use rerun::datatypes;
 use rerun::external::re_sdk_types::blueprint::archetypes::{
-    Background, ContainerBlueprint, LineGrid3D, PanelBlueprint, PlotLegend, TextLogColumns,
-    TimeAxis, TimePanelBlueprint, ViewBlueprint, ViewContents, ViewportBlueprint,
-    VisibleTimeRanges,
+    Background, EyeControls3D, LineGrid3D, PlotLegend, TextLogColumns, TimeAxis, VisualBounds2D,
 };
 use rerun::external::re_sdk_types::blueprint::components::{
-    BackgroundKind, ContainerKind, Corner2D, PanelState, PlayState, TimeRange, VisibleTimeRange,
+    BackgroundKind, ContainerKind, Corner2D, TimeRange, VisibleTimeRange,
 };
 use rerun::external::re_sdk_types::blueprint::datatypes::{
     TextLogColumn, TextLogColumnKind, TimelineColumn,
@@ -20,55 +15,44 @@ use rerun::external::re_sdk_types::blueprint::datatypes::{
 use rerun::external::re_sdk_types::blueprint::views::{
     Spatial2DView, Spatial3DView, TextLogView, TimeSeriesView,
 };
-use rerun::external::uuid::Uuid;
-use rerun::{
-    Archetype, AsComponents, RecordingStream, RecordingStreamBuilder, RecordingStreamResult,
-    datatypes,
-};
 
-use super::Contents;
+use super::layout::{self, Layout, Node};
 use super::plots::{self, Plot, Tab};
-use super::scene;
 use super::timeline::{FRAME, TIME};
+use super::{Contents, MapColor, Purpose, RecordingConfig};
+use super::{belief, keypoints, map, scene};
 
 const BACKGROUND: [u8; 3] = [18, 20, 26];
+/// How far back the tracks of key points are shown, in time and in frames.
+const TRACK_NANOS: i64 = 500_000_000;
+const TRACK_FRAMES: i64 = 15;
 
 /// Makes the layout part of the recording, as the one to open with.
 pub(super) fn send(
     stream: &RecordingStream,
     application: &'static str,
     contents: &Contents,
+    config: &RecordingConfig,
 ) -> RecordingStreamResult<()> {
-    let id = StoreId::new(StoreKind::Blueprint, application, contents.name.as_str());
-    let (blueprint, storage) = RecordingStreamBuilder::from_store_id(&id).enabled(true).memory()?;
-    blueprint.set_log_time_enabled(false);
-    blueprint.set_time_sequence("blueprint", 0);
-    Layout { stream: blueprint, nodes: 0 }.log(contents)?;
-    let activation =
-        BlueprintActivationCommand { blueprint_id: id, make_active: true, make_default: true };
-    stream.send_blueprint(storage.take(), activation);
-    Ok(())
-}
-
-struct Layout {
-    stream: RecordingStream,
-    nodes: u128,
-}
-
-/// A view or container that has been written.
-struct Node {
-    id: Uuid,
-    path: String,
+    layout::send(stream, application, &contents.name, |layout| {
+        let mut pages = Vec::new();
+        for purpose in Purpose::ALL {
+            pages.push(match purpose {
+                Purpose::Overview => layout.overview(contents, config.map_color)?,
+                Purpose::Uncertainty => layout.uncertainty(contents, config.map_color)?,
+                Purpose::Timing => layout.timing()?,
+            });
+        }
+        let active = Purpose::ALL.iter().position(|purpose| *purpose == config.blueprint);
+        layout.tabs("mfg-vio", &pages, active.unwrap_or(0))
+    })
 }
 
 impl Layout {
-    fn log(mut self, contents: &Contents) -> RecordingStreamResult<()> {
-        let world = self.world()?;
-        let camera = self.view::<Spatial2DView>(
-            "Camera: inliers green, outliers red, new blue, others grey",
-            scene::IMAGE,
-            &["+ $origin/**".to_owned(), format!("- {}", scene::DEPTH)],
-        )?;
+    fn overview(&mut self, contents: &Contents, color: MapColor) -> RecordingStreamResult<Node> {
+        let world = self.world(color)?;
+        self.hide(&world, map::ELLIPSOIDS)?;
+        let camera = self.camera()?;
         let depth =
             self.view::<Spatial2DView>("Depth", scene::IMAGE, &[format!("+ {}", scene::DEPTH)])?;
         let images =
@@ -76,47 +60,53 @@ impl Layout {
         let spatial =
             self.container(ContainerKind::Horizontal, "Space", &[(world, 3.0), (images, 2.0)])?;
 
+        let truth = contents.truth.then_some(&plots::ERROR);
+        let imu = contents.imu.then_some(&plots::IMU);
+        let always = [&plots::UNCERTAINTY, &plots::BELIEF, &plots::TRACKING, &plots::STATE];
         let mut tabs = Vec::new();
-        if contents.truth {
-            tabs.push((self.tab(&plots::ERROR)?, 1.0));
+        for tab in truth.into_iter().chain(always).chain(imu).chain([&plots::TIMES]) {
+            tabs.push(self.tab(tab)?);
         }
-        for tab in [&plots::UNCERTAINTY, &plots::BELIEF, &plots::TRACKING, &plots::STATE] {
-            tabs.push((self.tab(tab)?, 1.0));
-        }
-        if contents.imu {
-            tabs.push((self.tab(&plots::IMU)?, 1.0));
-        }
-        tabs.push((self.tab(&plots::TIMES)?, 1.0));
-        let plots = self.container(ContainerKind::Tabs, "Plots", &tabs)?;
+        let plots = self.tabs("Plots", &tabs, 0)?;
         let log = self.log_view()?;
-        let below = self.container(
-            ContainerKind::Horizontal,
-            "Plots and log",
-            &[(plots, 3.0), (log, 1.0)],
-        )?;
-
-        let root =
-            self.container(ContainerKind::Vertical, "mfg-vio", &[(spatial, 5.0), (below, 3.0)])?;
-        let viewport = ViewportBlueprint::new()
-            .with_root_container(root.id)
-            .with_auto_layout(false)
-            .with_auto_views(false);
-        self.stream.log("viewport", &viewport)?;
-        for panel in ["blueprint_panel", "selection_panel"] {
-            self.stream.log(panel, &PanelBlueprint::new().with_state(PanelState::Collapsed))?;
-        }
-        // At the end of a file the whole run is in sight; a live view keeps up.
-        let time_panel = TimePanelBlueprint::new()
-            .with_state(PanelState::Collapsed)
-            .with_timeline(TIME)
-            .with_play_state(PlayState::Following);
-        self.stream.log("time_panel", &time_panel)
+        let below = [(plots, 3.0), (log, 1.0)];
+        let below = self.container(ContainerKind::Horizontal, "Plots and log", &below)?;
+        let rows = [(spatial, 5.0), (below, 3.0)];
+        self.container(ContainerKind::Vertical, Purpose::Overview.title(), &rows)
     }
 
-    fn world(&mut self) -> RecordingStreamResult<Node> {
+    fn uncertainty(&mut self, contents: &Contents, color: MapColor) -> RecordingStreamResult<Node> {
+        let attitude = self.attitude()?;
+        let correlation = self.correlation()?;
+        let world = self.world(color)?;
+        let above = [(attitude, 3.0), (correlation, 2.0), (world, 4.0)];
+        let above = self.container(ContainerKind::Horizontal, "Belief", &above)?;
+        let truth = contents.truth.then_some(&plots::ERROR);
+        let mut rows = vec![(above, 2.0)];
+        for tab in truth.into_iter().chain([&plots::UNCERTAINTY]) {
+            rows.push((self.tab(tab)?, 1.0));
+        }
+        let belief = self.tab(&plots::BELIEF)?;
+        let state = self.tab(&plots::STATE)?;
+        rows.push((self.tabs("Belief and state", &[belief, state], 0)?, 1.1));
+        self.container(ContainerKind::Vertical, Purpose::Uncertainty.title(), &rows)
+    }
+
+    fn timing(&mut self) -> RecordingStreamResult<Node> {
+        let times = self.tab(&plots::TIMES)?;
+        let tracking = self.tab(&plots::TRACKING)?;
+        let camera = self.camera()?;
+        let log = self.log_view()?;
+        let below = [(tracking, 4.0), (camera, 2.0), (log, 2.0)];
+        let below = self.container(ContainerKind::Horizontal, "Work", &below)?;
+        let rows = [(times, 1.2), (below, 1.0)];
+        self.container(ContainerKind::Vertical, Purpose::Timing.title(), &rows)
+    }
+
+    fn world(&mut self, color: MapColor) -> RecordingStreamResult<Node> {
         // Depth is recorded less often than poses: in space it would trail behind the camera.
         let world = self.view::<Spatial3DView>(
-            "World: estimate orange, truth blue; map by σ from 3 mm (green) to 0.3 m (magenta)",
+            &format!("World: estimate orange, truth blue; {}", color.legend()),
             scene::WORLD,
             &[
                 "+ $origin/**".to_owned(),
@@ -124,16 +114,50 @@ impl Layout {
                 format!("- {}/**", scene::KEYPOINTS),
             ],
         )?;
-        self.property(&world, &Background::new(BackgroundKind::SolidColor).with_color(BACKGROUND))?;
+        self.property(&world, &background())?;
         self.property(&world, &LineGrid3D::new().with_visible(true))?;
         for trajectory in scene::TRAJECTORIES {
-            let path = ViewContents::blueprint_base_visualizer_path_for_entity(
-                world.id,
-                &trajectory.into(),
-            );
-            self.stream.log(path, &VisibleTimeRanges::new([TIME, FRAME].map(up_to_cursor)))?;
+            self.time_ranges(&world, trajectory, [TIME, FRAME].map(up_to_cursor))?;
         }
         Ok(world)
+    }
+
+    fn camera(&mut self) -> RecordingStreamResult<Node> {
+        let camera = self.view::<Spatial2DView>(
+            "Camera: inliers green, outliers red, new blue, others grey; tracks yellow",
+            scene::IMAGE,
+            &["+ $origin/**".to_owned(), format!("- {}", scene::DEPTH)],
+        )?;
+        let ranges = [(TIME, TRACK_NANOS), (FRAME, TRACK_FRAMES)];
+        self.time_ranges(&camera, keypoints::TRACKS, ranges.map(|(t, back)| recent(t, back)))?;
+        Ok(camera)
+    }
+
+    fn attitude(&mut self) -> RecordingStreamResult<Node> {
+        let sphere = self.view::<Spatial3DView>(
+            "Where the body axes x, y, z may point (at least 3° wide); truth white",
+            belief::ATTITUDE,
+            &["+ $origin/**".to_owned()],
+        )?;
+        self.property(&sphere, &background())?;
+        self.property(&sphere, &LineGrid3D::new().with_visible(false))?;
+        let eye = EyeControls3D::new()
+            .with_position([2.6, 2.0, 1.5])
+            .with_look_target([0.0, 0.0, 0.0])
+            .with_eye_up([0.0, 0.0, 1.0]);
+        self.property(&sphere, &eye)?;
+        Ok(sphere)
+    }
+
+    fn correlation(&mut self) -> RecordingStreamResult<Node> {
+        let correlation = self.view::<Spatial2DView>(
+            "Correlation of rotation φ and position: −1 blue, +1 red",
+            belief::CORRELATION,
+            &["+ $origin/**".to_owned()],
+        )?;
+        let range = datatypes::Range2D { x_range: [-1.0, 6.4].into(), y_range: [-1.0, 6.4].into() };
+        self.property(&correlation, &VisualBounds2D::new(range))?;
+        Ok(correlation)
     }
 
     fn log_view(&mut self) -> RecordingStreamResult<Node> {
@@ -158,73 +182,52 @@ impl Layout {
     }
 
     fn plot(&mut self, plot: &Plot) -> RecordingStreamResult<Node> {
-        let view =
-            self.view::<TimeSeriesView>(plot.title, plot.entity, &["+ $origin".to_owned()])?;
+        self.time_series(plot.title, plot.entity, &["+ $origin".to_owned()])
+    }
+
+    /// A plot over the whole time.
+    pub(super) fn time_series(
+        &mut self,
+        title: &str,
+        origin: &str,
+        contents: &[String],
+    ) -> RecordingStreamResult<Node> {
+        let view = self.view::<TimeSeriesView>(title, origin, contents)?;
         let whole = TimeRange(datatypes::TimeRange::EVERYTHING);
         self.property(&view, &TimeAxis::new().with_view_range(whole))?;
         self.property(&view, &PlotLegend::new().with_corner(Corner2D::LeftTop))?;
         Ok(view)
     }
+}
 
-    fn view<V: View>(
-        &mut self,
-        name: &str,
-        origin: &str,
-        contents: &[String],
-    ) -> RecordingStreamResult<Node> {
-        let node = self.node("view");
-        let view = ViewBlueprint::new(V::identifier().as_str())
-            .with_display_name(name)
-            .with_space_origin(origin);
-        self.stream.log(node.path.as_str(), &view)?;
-        self.property(&node, &ViewContents::new(contents.iter().map(String::as_str)))?;
-        Ok(node)
+impl Purpose {
+    fn title(self) -> &'static str {
+        match self {
+            Self::Overview => "Overview",
+            Self::Uncertainty => "Uncertainty",
+            Self::Timing => "Timing",
+        }
     }
+}
 
-    /// Sets a property of a view.
-    fn property<T: Archetype + AsComponents>(
-        &self,
-        view: &Node,
-        property: &T,
-    ) -> RecordingStreamResult<()> {
-        self.stream.log(format!("{}/{}", view.path, T::name().short_name()), property)
-    }
-
-    /// A container of nodes, each with its share of the space.
-    fn container(
-        &mut self,
-        kind: ContainerKind,
-        name: &str,
-        children: &[(Node, f32)],
-    ) -> RecordingStreamResult<Node> {
-        let node = self.node("container");
-        let shares = children.iter().map(|(_, share)| *share);
-        let container = ContainerBlueprint::new(kind)
-            .with_display_name(name)
-            .with_contents(children.iter().map(|(child, _)| child.path.as_str()));
-        let container = match kind {
-            ContainerKind::Horizontal => container.with_col_shares(shares),
-            ContainerKind::Vertical => container.with_row_shares(shares),
-            ContainerKind::Tabs | ContainerKind::Grid => container,
-        };
-        self.stream.log(node.path.as_str(), &container)?;
-        Ok(node)
-    }
-
-    fn node(&mut self, kind: &str) -> Node {
-        self.nodes += 1;
-        let id = Uuid::from_u128(self.nodes);
-        Node { id, path: format!("{kind}/{id}") }
-    }
+pub(super) fn background() -> Background {
+    Background::new(BackgroundKind::SolidColor).with_color(BACKGROUND)
 }
 
 /// All that was logged until the time that the viewer shows.
 fn up_to_cursor(timeline: &str) -> VisibleTimeRange {
+    visible(timeline, datatypes::TimeRangeBoundary::Infinite)
+}
+
+/// What was logged within `back` before the time that the viewer shows.
+fn recent(timeline: &str, back: i64) -> VisibleTimeRange {
+    visible(timeline, datatypes::TimeRangeBoundary::CursorRelative(datatypes::TimeInt(-back)))
+}
+
+fn visible(timeline: &str, start: datatypes::TimeRangeBoundary) -> VisibleTimeRange {
+    let end = datatypes::TimeRangeBoundary::CursorRelative(datatypes::TimeInt(0));
     VisibleTimeRange(datatypes::VisibleTimeRange {
         timeline: timeline.into(),
-        range: datatypes::TimeRange {
-            start: datatypes::TimeRangeBoundary::Infinite,
-            end: datatypes::TimeRangeBoundary::CursorRelative(datatypes::TimeInt(0)),
-        },
+        range: datatypes::TimeRange { start, end },
     })
 }

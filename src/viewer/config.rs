@@ -15,6 +15,53 @@ pub struct Contents {
     pub imu: bool,
 }
 
+/// What one wants to see first when a recording is opened; the others are a click away.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Purpose {
+    /// Where the run went and what the camera saw.
+    #[default]
+    Overview,
+    /// What the filter believed, and whether it was right.
+    Uncertainty,
+    /// Where the time went.
+    Timing,
+}
+
+impl Purpose {
+    pub const ALL: [Self; 3] = [Self::Overview, Self::Uncertainty, Self::Timing];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Overview => "overview",
+            Self::Uncertainty => "uncertainty",
+            Self::Timing => "timing",
+        }
+    }
+}
+
+impl std::str::FromStr for Purpose {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        Self::ALL.into_iter().find(|purpose| purpose.name() == text).ok_or_else(|| {
+            let names = Self::ALL.map(Self::name);
+            format!("unknown blueprint `{text}`; there are: {}", names.join(", "))
+        })
+    }
+}
+
+/// What the colors of map points tell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MapColor {
+    /// Standard deviation of the position.
+    #[default]
+    Sigma,
+    /// Frames since the point was inserted.
+    Age,
+}
+
 /// What goes into a recording, and how often.
 ///
 /// The size of a recording is nearly all images: at 640x480 and 30 Hz about 30 to 50 kB a color
@@ -22,6 +69,8 @@ pub struct Contents {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RecordingConfig {
+    /// What the recording opens with.
+    pub blueprint: Purpose,
     /// Record the color image and the key points of every n-th frame; 0: of none.
     pub image_every: u64,
     /// JPEG quality of color images, 1 (smallest) to 100 (best).
@@ -30,6 +79,13 @@ pub struct RecordingConfig {
     pub depth_every: u64,
     /// Record the map at every n-th frame; 0: never.
     pub map_every: u64,
+    /// What the colors of map points tell.
+    pub map_color: MapColor,
+    /// With the map, record the 3 sigma ellipsoids of so many of its newest points; 0: of none.
+    pub map_ellipsoids: usize,
+    /// Record the density of the attitude and the correlations of the pose at every n-th frame;
+    /// 0: never.
+    pub belief_every: u64,
     /// Record every n-th IMU sample; 0: none.
     pub imu_every: u64,
     /// Frames that may wait to be written, at least 1. When as many wait, a recording into a file
@@ -40,10 +96,14 @@ pub struct RecordingConfig {
 impl Default for RecordingConfig {
     fn default() -> Self {
         Self {
+            blueprint: Purpose::Overview,
             image_every: 2,
             jpeg_quality: 75,
             depth_every: 15,
             map_every: 30,
+            map_color: MapColor::Sigma,
+            map_ellipsoids: 300,
+            belief_every: 6,
             imu_every: 2,
             queue_length: 16,
         }

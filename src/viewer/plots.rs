@@ -3,7 +3,8 @@
 use nalgebra::{Isometry3, Vector3};
 use rerun::{RecordingStream, RecordingStreamResult, Scalars, SeriesLines};
 
-use super::covariance::{principal_axes, standard_deviations};
+use super::covariance::{diagonal_block, principal_axes, standard_deviations};
+use crate::evaluation::normalised_square;
 use crate::inertial::ImuSample;
 use crate::inertial::block;
 use crate::odometry::StepReport;
@@ -77,6 +78,21 @@ const INNOVATION: Plot = Plot {
     title: "Squared innovation a degree of freedom",
     series: &[line("innovation", BLUE), bound("consistent", GREY)],
 };
+const ACCEPTED: Plot = Plot {
+    entity: "plots/gate/accepted",
+    title: "Matches accepted [%]",
+    series: &[line("accepted", GREEN)],
+};
+const NEES: Plot = Plot {
+    entity: "plots/nees",
+    title: "log10 NEES of position and attitude, 95 % band",
+    series: &[
+        line("position", BLUE),
+        line("attitude", ORANGE),
+        bound("97.5 %", GREY),
+        bound("2.5 %", GREY),
+    ],
+};
 const FEATURES: Plot = Plot {
     entity: "plots/counts/features",
     title: "Key points and map points of a frame",
@@ -114,6 +130,7 @@ const TIMING: Plot = Plot {
         line("update", BLUE),
         line("map", RED),
         line("sum", GREY),
+        bound("frame interval", ORANGE),
     ],
 };
 const ANGULAR_VELOCITY: Plot =
@@ -127,10 +144,11 @@ pub(super) struct Tab {
     pub(super) plots: &'static [Plot],
 }
 
-pub(super) const ERROR: Tab = Tab { name: "Error", plots: &[POSITION_ERROR, ATTITUDE_ERROR] };
+pub(super) const ERROR: Tab = Tab { name: "Error", plots: &[POSITION_ERROR, ATTITUDE_ERROR, NEES] };
 pub(super) const UNCERTAINTY: Tab =
-    Tab { name: "Uncertainty", plots: &[POSITION_SIGMA, ATTITUDE_SIGMA, VELOCITY_SIGMA] };
-pub(super) const BELIEF: Tab = Tab { name: "Belief", plots: &[MATRIX_FISHER_S, INNOVATION] };
+    Tab { name: "σ", plots: &[POSITION_SIGMA, ATTITUDE_SIGMA, VELOCITY_SIGMA] };
+pub(super) const BELIEF: Tab =
+    Tab { name: "Belief", plots: &[MATRIX_FISHER_S, INNOVATION, ACCEPTED] };
 pub(super) const TRACKING: Tab = Tab { name: "Tracking", plots: &[FEATURES, MAP_SIZE] };
 pub(super) const STATE: Tab = Tab { name: "State", plots: &[VELOCITY, GYRO_BIAS, ACCEL_BIAS] };
 pub(super) const IMU: Tab = Tab { name: "IMU", plots: &[ANGULAR_VELOCITY, SPECIFIC_FORCE] };
@@ -150,11 +168,13 @@ pub(super) fn log_styles(stream: &RecordingStream) -> RecordingStreamResult<()> 
     Ok(())
 }
 
-/// The numbers of one frame, at the stream's current time.
+/// The numbers of one frame, at the stream's current time; `interval` is the time since the frame
+/// before, s.
 pub(super) fn log_report(
     stream: &RecordingStream,
     report: &StepReport,
     truth: Option<&Isometry3<f64>>,
+    interval: Option<f64>,
 ) -> RecordingStreamResult<()> {
     let log = |plot: &Plot, values: &[f64]| log(stream, plot, values);
     let sigma = |block| standard_deviations(&report.covariance, block);
@@ -164,11 +184,12 @@ pub(super) fn log_report(
         let [position, attitude] = errors(report, truth);
         log(&POSITION_ERROR, &position)?;
         log(&ATTITUDE_ERROR, &attitude.map(f64::to_degrees))?;
+        log(&NEES, &log_nees(report, truth))?;
     }
     log(&POSITION_SIGMA, sigma(block::POSITION).as_slice())?;
     log(&ATTITUDE_SIGMA, degrees(sigma(block::ROTATION)).as_slice())?;
     log(&VELOCITY_SIGMA, sigma(block::VELOCITY).as_slice())?;
-    if let Some(s) = report.matrix_fisher_s {
+    if let Some(s) = report.matrix_fisher.map(|svd| svd.s) {
         log(&MATRIX_FISHER_S, s.map(signed_log).as_slice())?;
     }
     if let Some(innovation) = report.innovation {
@@ -184,12 +205,15 @@ pub(super) fn log_report(
         counts.new_points,
     ];
     log(&FEATURES, &of_frame.map(|count| count as f64))?;
+    if counts.matches > 0 {
+        log(&ACCEPTED, &[100.0 * counts.inliers as f64 / counts.matches as f64])?;
+    }
     log(&MAP_SIZE, &[counts.map_points as f64])?;
     log(&VELOCITY, report.state.velocity.as_slice())?;
     let gyro_bias = degrees(report.state.gyro_bias);
     log(&GYRO_BIAS, &with_bands(gyro_bias, degrees(sigma(block::GYRO_BIAS))))?;
     log(&ACCEL_BIAS, &with_bands(report.state.accel_bias, sigma(block::ACCEL_BIAS)))?;
-    log(&TIMING, &stage_milliseconds(report))
+    log(&TIMING, &stage_milliseconds(report, interval))
 }
 
 /// A sample of the IMU, at the stream's current time.
@@ -206,7 +230,7 @@ fn log(stream: &RecordingStream, plot: &Plot, values: &[f64]) -> RecordingStream
 /// Error and largest 3 sigma of the position (m) and of the attitude (rad).
 fn errors(report: &StepReport, truth: &Isometry3<f64>) -> [[f64; 2]; 2] {
     let estimate = &report.state.world_from_body;
-    let largest = |block| match principal_axes(&report.covariance, block) {
+    let largest = |block| match principal_axes(&diagonal_block(&report.covariance, block)) {
         Some((deviations, _)) => 3.0 * deviations.max(),
         None => f64::NAN,
     };
@@ -226,21 +250,53 @@ fn with_bands(value: Vector3<f64>, sigma: Vector3<f64>) -> [f64; 9] {
     [value.x, value.y, value.z, low.x, high.x, low.y, high.y, low.z, high.z]
 }
 
-fn stage_milliseconds(report: &StepReport) -> [f64; 7] {
-    let [a, b, c, d, e, f] = report.times.stages().map(|(_, seconds)| 1e3 * seconds);
-    [a, b, c, d, e, f, a + b + c + d + e + f]
+/// Position and attitude errors squared over what is believed of them, and the two-sided 95 %
+/// band of three degrees of freedom; common logarithms, since the errors of an overconfident
+/// filter span decades. NaN leaves a gap.
+fn log_nees(report: &StepReport, truth: &Isometry3<f64>) -> [f64; 4] {
+    let estimate = &report.state.world_from_body;
+    let position = truth.translation.vector - estimate.translation.vector;
+    let attitude = (estimate.rotation.inverse() * truth.rotation).scaled_axis();
+    let nees = |error, block| {
+        normalised_square(error, diagonal_block(&report.covariance, block)).unwrap_or(f64::NAN)
+    };
+    let [lower, upper] = NEES_BAND;
+    [nees(&position, block::POSITION), nees(&attitude, block::ROTATION), upper, lower]
+        .map(|nees: f64| nees.clamp(SMALLEST_NEES, f64::INFINITY).log10())
+}
+
+/// Quantiles of the chi-square distribution of three degrees of freedom.
+const NEES_BAND: [f64; 2] = [0.215_795, 9.348_404];
+/// The first poses are put on each other, which makes their error zero.
+const SMALLEST_NEES: f64 = 1e-3;
+
+/// The order of [`TIMING`].
+fn stage_milliseconds(report: &StepReport, interval: Option<f64>) -> Vec<f64> {
+    let stages = report.times.stages().map(|(_, seconds)| 1e3 * seconds);
+    let last = [stages.iter().sum(), 1e3 * interval.unwrap_or(f64::NAN)];
+    stages.into_iter().chain(last).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::evaluation::NeesSummary;
     use crate::odometry::StageTimes;
+
+    #[test]
+    fn the_band_is_that_of_the_evaluation() {
+        let summary = NeesSummary::of(&[1.0], 3, 0.95).unwrap();
+        for (bound, expected) in NEES_BAND.iter().zip(summary.band) {
+            assert!((bound - expected).abs() < 1e-6, "{bound} {expected}");
+        }
+    }
 
     #[test]
     fn stages_have_the_names_and_order_of_the_report() {
         let names: Vec<_> = TIMING.series.iter().map(|series| series.name).collect();
         let stages = StageTimes::default().stages().map(|(name, _)| name);
-        assert_eq!(names[..6], stages);
+        assert_eq!(names[..stages.len()], stages);
+        assert_eq!(names.len(), stages.len() + 2);
     }
 
     #[test]

@@ -11,15 +11,18 @@ use rerun::sink::{FileSink, FileSinkError, GrpcSink, GrpcSinkConnectionState, Lo
 use rerun::{RecordingStream, RecordingStreamBuilder, SpawnError, SpawnOptions};
 
 use super::config::is_due;
+use super::keypoints::{self, Tracks};
+use super::map::{self, MapLog};
 use super::scene::{self, Scene};
+use super::sphere::Sphere;
 use super::timeline::{Clock, FRAME, TIME};
-use super::{Contents, RecordingConfig, ViewerError, blueprint, image, plots};
-use crate::inertial::ImuSample;
+use super::{Contents, RecordingConfig, ViewerError, belief, blueprint, image, plots};
+use crate::inertial::{ImuSample, Stamp};
 use crate::odometry::StepReport;
 use crate::vision::{ColorImage, DepthImage, PinholeCamera, RgbdFrame};
 
 /// Viewers keep the layout that a user has arranged by the application's name.
-const APPLICATION: &str = "mfg-vio";
+pub(super) const APPLICATION: &str = "mfg-vio";
 /// How long a viewer may take to receive what is left at the end.
 const VIEWER_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a viewer that is said to run may take to answer.
@@ -68,6 +71,7 @@ struct Frame {
     imu: Vec<ImuSample>,
     color: Option<ColorImage>,
     depth: Option<DepthImage>,
+    belief: bool,
 }
 
 impl Recorder {
@@ -87,12 +91,9 @@ impl Recorder {
         }
         let files: Vec<PathBuf> = sinks.iter().filter_map(Sink::file).collect();
         let lossy = files.is_empty();
-        let stream = open(sinks, contents)?;
-        blueprint::send(&stream, APPLICATION, contents)?;
-        scene::log_styles(&stream)?;
-        plots::log_styles(&stream)?;
+        let stream = open(sinks, &contents.name)?;
+        let mut writer = Writer::new(stream, contents, config)?;
         let (sender, receiver) = sync_channel(config.queue_length);
-        let mut writer = Writer::new(stream, config.jpeg_quality);
         let writer = std::thread::Builder::new()
             .name("recorder".to_owned())
             .spawn(move || {
@@ -164,6 +165,7 @@ impl Recorder {
             imu: std::mem::take(&mut self.imu),
             color: is_due(number, self.config.image_every).then(|| images.color.clone()),
             depth: is_due(number, self.config.depth_every).then(|| images.depth.clone()),
+            belief: is_due(number, self.config.belief_every),
         }))
     }
 
@@ -218,7 +220,7 @@ impl Sink {
     }
 }
 
-fn create(path: &Path) -> Result<FileSink, ViewerError> {
+pub(super) fn create(path: &Path) -> Result<FileSink, ViewerError> {
     FileSink::new(path).map_err(|error| match error {
         FileSinkError::CreateFile { source, path } => ViewerError::Create { path, source },
         FileSinkError::SpawnThread(source) => ViewerError::Thread(source),
@@ -258,7 +260,8 @@ fn spawn() -> Result<String, ViewerError> {
     Ok(format!("rerun+http://127.0.0.1:{}/proxy", viewer.port))
 }
 
-fn open(sinks: &[Sink], contents: &Contents) -> Result<RecordingStream, ViewerError> {
+/// A stream into `sinks`, without a clock of its own.
+pub(super) fn open(sinks: &[Sink], name: &str) -> Result<RecordingStream, ViewerError> {
     let opened: Vec<Box<dyn LogSink>> = sinks.iter().map(Sink::open).collect::<Result<_, _>>()?;
     let live = sinks.iter().any(|sink| sink.file().is_none());
     // Few large chunks: each costs a kilobyte and time in the viewer. In files they end by size
@@ -270,11 +273,11 @@ fn open(sinks: &[Sink], contents: &Contents) -> Result<RecordingStream, ViewerEr
         .batcher_config(ChunkBatcherConfig { flush_tick, ..ChunkBatcherConfig::DEFAULT });
     // A running viewer would merge runs of one identity.
     if !live {
-        builder = builder.recording_id(contents.name.as_str());
+        builder = builder.recording_id(name);
     }
     let stream = builder.set_sinks(opened)?;
     stream.set_log_time_enabled(false);
-    stream.send_recording_name(contents.name.as_str())?;
+    stream.send_recording_name(name)?;
     Ok(stream)
 }
 
@@ -282,14 +285,42 @@ fn open(sinks: &[Sink], contents: &Contents) -> Result<RecordingStream, ViewerEr
 struct Writer {
     stream: RecordingStream,
     jpeg_quality: u8,
+    truth: bool,
     clock: Option<Clock>,
     scene: Scene,
+    map: MapLog,
+    tracks: Tracks,
+    sphere: Sphere,
+    last_frame: Option<Stamp>,
     problem: Option<ViewerError>,
 }
 
 impl Writer {
-    fn new(stream: RecordingStream, jpeg_quality: u8) -> Self {
-        Self { stream, jpeg_quality, clock: None, scene: Scene::default(), problem: None }
+    /// Writes what does not depend on time.
+    fn new(
+        stream: RecordingStream,
+        contents: &Contents,
+        config: &RecordingConfig,
+    ) -> Result<Self, ViewerError> {
+        let sphere = belief::sphere();
+        blueprint::send(&stream, APPLICATION, contents, config)?;
+        scene::log_styles(&stream)?;
+        map::log_styles(&stream)?;
+        keypoints::log_styles(&stream)?;
+        belief::log_styles(&stream, &sphere, contents.truth)?;
+        plots::log_styles(&stream)?;
+        Ok(Self {
+            stream,
+            jpeg_quality: config.jpeg_quality,
+            truth: contents.truth,
+            clock: None,
+            scene: Scene::default(),
+            map: MapLog::new(config.map_color, config.map_ellipsoids),
+            tracks: Tracks::default(),
+            sphere,
+            last_frame: None,
+            problem: None,
+        })
     }
 
     /// Writes until the queue is closed. A message that cannot be written is left out, for the
@@ -298,7 +329,7 @@ impl Writer {
         for message in receiver {
             let result = match message {
                 Message::Camera { camera, imu_from_camera, size } => {
-                    scene::log_camera(&self.stream, &camera, &imu_from_camera, size)
+                    scene::log_camera(&self.stream, &camera, &imu_from_camera, size, self.truth)
                         .map_err(ViewerError::from)
                 }
                 Message::Frame(frame) => self.log_frame(&frame),
@@ -310,7 +341,7 @@ impl Writer {
     }
 
     fn log_frame(&mut self, frame: &Frame) -> Result<(), ViewerError> {
-        let Frame { report, truth, imu, color, depth } = frame;
+        let Frame { report, truth, imu, color, depth, belief } = frame;
         self.log_imu(imu)?;
         let clock = *self.clock.get_or_insert_with(|| Clock::of(report.stamp));
         let number = i64::try_from(report.frame).unwrap_or(i64::MAX);
@@ -318,12 +349,20 @@ impl Writer {
         self.stream.set_time_sequence(FRAME, number);
 
         self.scene.log_report(&self.stream, report, truth.as_ref())?;
-        plots::log_report(&self.stream, report, truth.as_ref())?;
+        if let Some(map) = &report.map {
+            self.map.log(&self.stream, map)?;
+        }
+        if *belief {
+            belief::log(&self.stream, &self.sphere, report, truth.as_ref())?;
+        }
+        let interval = self.last_frame.replace(report.stamp);
+        let interval = interval.map(|last| report.stamp.seconds_since(last));
+        plots::log_report(&self.stream, report, truth.as_ref(), interval)?;
         scene::log_notes(&self.stream, &report.notes)?;
         if let Some(color) = color {
             let encoded = image::color(color, self.jpeg_quality, report.frame)?;
             self.stream.log(scene::COLOR, &encoded)?;
-            scene::log_keypoints(&self.stream, &report.keypoints)?;
+            keypoints::log(&self.stream, &report.keypoints, &mut self.tracks)?;
         }
         if let Some(depth) = depth {
             self.stream.log(scene::DEPTH, &image::depth(depth, report.frame)?)?;
@@ -357,7 +396,7 @@ impl Writer {
 }
 
 /// Rerun tells of a failure to write only in its log; a footer tells that there was none.
-fn check_complete(path: &Path) -> Result<(), ViewerError> {
+pub(super) fn check_complete(path: &Path) -> Result<(), ViewerError> {
     use std::io::{Read, Seek, SeekFrom};
 
     let end = i64::try_from(StreamFooter::ENCODED_SIZE_BYTES).unwrap_or(i64::MAX);

@@ -17,6 +17,7 @@ use crate::inertial::{ImuSample, NavCovariance, NavState, Stamp, block};
 use crate::odometry::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
+use crate::so3::ProperSvd;
 use crate::vision::{ColorImage, DepthImage, PinholeCamera, PixelFormat, RgbdFrame};
 
 const SIZE: [usize; 2] = [320, 240];
@@ -90,7 +91,11 @@ impl Walk {
             },
             covariance: Self::covariance(time),
             world_from_camera,
-            matrix_fisher_s: Some(Vector3::new(4e5, 3e5, 2e5) / (1.0 + time)),
+            matrix_fisher: Some(ProperSvd {
+                u: world_from_body.rotation.to_rotation_matrix(),
+                s: Vector3::new(4e5, 3e5, 2e5) / (1.0 + time),
+                v: Rotation3::identity(),
+            }),
             innovation: Some(self.rng.random_range(0.7..1.3)),
             counts: StepCounts {
                 features: keypoints.len(),
@@ -146,7 +151,7 @@ impl Walk {
             (0.0..width).contains(&pixel.x) && (0.0..height).contains(&pixel.y)
         };
         let mut keypoints = Vec::new();
-        for (point, &role) in self.map.iter().zip(roles.iter().cycle()) {
+        for ((id, point), &role) in (0..).zip(&self.map).zip(roles.iter().cycle()) {
             let in_camera = world_from_camera.inverse_transform_point(&(*point).into()).coords;
             let Some(predicted) = CAMERA.project(&in_camera).filter(seen) else { continue };
             let offset = if role == KeypointRole::Outlier { 20.0 } else { 2.0 };
@@ -156,6 +161,7 @@ impl Walk {
             keypoints.push(KeypointView {
                 pixel: [predicted[0] + scatter(), predicted[1] + scatter()],
                 predicted: matched.then_some(predicted),
+                point: matched.then_some(id),
                 role,
             });
         }
@@ -172,7 +178,7 @@ impl Walk {
         points
             .map(|(index, point)| MapPointView {
                 position: point.cast::<f32>().into(),
-                sigma: 0.003 * 1.003_f32.powi(index as i32),
+                covariance: Matrix3::identity() * (0.003 * 1.003_f32.powi(index as i32)).powi(2),
                 age: 0,
             })
             .collect()
@@ -260,7 +266,9 @@ fn a_recording_holds_every_frame_and_is_complete() {
     let rows = rows(&path);
     let count = |entity: &str| rows.get(entity).copied().unwrap_or(0);
     // One more row than frames: the static style of the entity.
-    for entity in ["/plots/error/position", "/plots/timing", "/world/estimate/covariance"] {
+    for entity in
+        ["/plots/error/position", "/plots/nees", "/plots/timing", "/world/estimate/covariance"]
+    {
         assert_eq!(count(entity), 60 + 1, "{entity} in {rows:?}");
     }
     assert_eq!(count("/world/estimate/body"), 60 + 1);
@@ -269,11 +277,16 @@ fn a_recording_holds_every_frame_and_is_complete() {
     assert_eq!(count("/world/estimate/trajectory"), 6 + 1);
     assert_eq!(count("/world/truth/trajectory"), 6 + 1);
     assert_eq!(count("/world/map"), 2 + 1);
+    assert_eq!(count("/world/map/ellipsoids"), 2 + 1);
+    for entity in ["density", "estimate", "truth"] {
+        assert_eq!(count(&format!("/belief/attitude/{entity}")), 10 + 1, "{entity}");
+    }
+    assert_eq!(count("/belief/correlation/image"), 10);
     let image = "/world/estimate/body/camera/image";
     assert_eq!(count(image), 1);
     assert_eq!(count(&format!("{image}/color")), 30);
     assert_eq!(count(&format!("{image}/depth")), 4);
-    for name in ["inliers", "outliers", "new", "unmatched", "no_depth", "matches"] {
+    for name in ["inliers", "outliers", "new", "unmatched", "no_depth", "matches", "tracks"] {
         assert_eq!(count(&format!("{image}/keypoints/{name}")), 30 + 1, "{name}");
     }
     assert_eq!(count("/plots/imu/gyro"), 99 + 1);
@@ -288,6 +301,7 @@ fn streams_that_are_switched_off_are_absent() {
         image_every: 0,
         depth_every: 0,
         map_every: 0,
+        belief_every: 0,
         imu_every: 0,
         ..Default::default()
     };
@@ -295,6 +309,7 @@ fn streams_that_are_switched_off_are_absent() {
     let rows = rows(&path);
     // Styles are there in any case.
     assert_eq!(rows["/world/map"], 1);
+    assert_eq!(rows["/belief/attitude/density"], 1);
     assert_eq!(rows["/plots/imu/gyro"], 1);
     assert!(!rows.keys().any(|entity| entity.ends_with("/color") || entity.ends_with("/depth")));
     assert_eq!(rows["/plots/timing"], 6);

@@ -1,6 +1,6 @@
 //! The two timelines of a recording.
 
-use rerun::TimeCell;
+use rerun::{TimeCell, TimeColumn};
 
 use crate::inertial::Stamp;
 
@@ -24,6 +24,15 @@ impl Clock {
 
     pub(super) fn of(stamp: Stamp) -> Self {
         if stamp < Self::EARLIEST_DATE { Self::Start } else { Self::Epoch }
+    }
+
+    /// Of many stamps, on the timeline [`TIME`].
+    pub(super) fn column(self, stamps: &[Stamp]) -> TimeColumn {
+        let nanos = stamps.iter().map(|stamp| stamp.nanos());
+        match self {
+            Self::Start => TimeColumn::new_duration_nanos(TIME, nanos),
+            Self::Epoch => TimeColumn::new_timestamp_nanos_since_epoch(TIME, nanos),
+        }
     }
 
     pub(super) fn cell(self, stamp: Stamp) -> TimeCell {

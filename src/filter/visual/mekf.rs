@@ -5,6 +5,7 @@ use nalgebra::{Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
 use super::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
 use crate::alignment::{PointPair, PoseInformation};
 use crate::inertial::{Belief, ImuSample, Propagator, block, symmetrize};
+use crate::so3::ProperSvd;
 
 /// Attitude error in the body frame, one linearisation an update, at the predicted state.
 #[derive(Debug, Clone)]
@@ -75,7 +76,7 @@ impl VisualInertialFilter for Mekf {
         Some(UpdateOutcome { innovation, points: information.points })
     }
 
-    fn matrix_fisher_s(&self) -> Option<Vector3<f64>> {
+    fn matrix_fisher(&self) -> Option<ProperSvd> {
         None
     }
 }

@@ -5,6 +5,7 @@ use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, UnitQuaternion, Vector3};
 use super::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
 use crate::alignment::{PointPair, PoseInformation, rotated_vector_by_rotation, vectorize};
 use crate::inertial::{Belief, ImuSample, NavCovariance, NavState, Propagator, block, symmetrize};
+use crate::so3::ProperSvd;
 
 /// Euclidean part of the state: (velocity, position, gyro bias, accelerometer bias).
 const EUCLIDEAN: usize = 12;
@@ -78,13 +79,8 @@ impl VisualInertialFilter for MfgFilter {
         Some(UpdateOutcome { innovation: innovation?, points })
     }
 
-    fn matrix_fisher_s(&self) -> Option<Vector3<f64>> {
-        let rotation = self.belief.covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION);
-        let information = rotation.into_owned().try_inverse()?;
-        let concentration = Matrix3::identity() * (0.5 * information.trace()) - information;
-        let mut s = concentration.symmetric_eigenvalues();
-        s.as_mut_slice().sort_by(|a, b| b.total_cmp(a));
-        Some(s)
+    fn matrix_fisher(&self) -> Option<ProperSvd> {
+        self.belief.attitude().map(|attitude| *attitude.svd())
     }
 }
 

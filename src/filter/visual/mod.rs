@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::alignment::{PointPair, PoseInformation, RobustKernel};
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block, symmetrize};
+use crate::so3::ProperSvd;
 
 pub use mekf::Mekf;
 pub use mfg::MfgFilter;
@@ -179,8 +180,8 @@ pub trait VisualInertialFilter: Send {
     /// finite belief follows from them.
     fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome>;
 
-    /// Proper singular values of the attitude's matrix Fisher part, if the filter has one.
-    fn matrix_fisher_s(&self) -> Option<Vector3<f64>>;
+    /// Parameter of the attitude's matrix Fisher part, if the filter has one.
+    fn matrix_fisher(&self) -> Option<ProperSvd>;
 }
 
 impl dyn VisualInertialFilter {
