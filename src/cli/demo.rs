@@ -8,7 +8,7 @@ use super::terminal::catch_interrupts;
 use mfg_vio::config::Config;
 use mfg_vio::dataset;
 use mfg_vio::evaluation::write_html;
-use mfg_vio::replay::report;
+use mfg_vio::replay::{figures, report};
 use mfg_vio::simulation::SceneConfig;
 
 /// Simulate a short log, replay it, evaluate it and draw it: the main job with no data at hand.
@@ -45,9 +45,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         recording: Target::files(&args.out),
     };
     let replayed = plan.execute()?;
-    let report = report(&replayed)?;
-    write_html(&args.out.join("report.html"), &report)?;
-    for (figure, name) in report.figures.iter().zip(["trajectory", "error", "features", "timing"]) {
+    write_html(&args.out.join("report.html"), &report(&replayed))?;
+    for (name, figure) in figures(&replayed) {
         figure.save(&args.out.join(name).with_extension("png"))?;
     }
     print_summary(&replayed.metrics, Some(&args.out));

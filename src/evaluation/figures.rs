@@ -49,21 +49,12 @@ pub fn trajectory_figure(pairs: &PosePairs, errors: &[f64], unit: &str) -> Figur
     }
 }
 
-/// Errors over time, with the estimator's own three standard deviations where it has them.
-pub fn error_figure(
-    stamps: &[f64],
-    errors: &[f64],
-    unit: &str,
-    three_sigma: Option<&[f64]>,
-) -> Figure {
-    let mut curves = vec![Curve { name: "error".to_owned(), points: series(stamps, errors) }];
-    if let Some(bound) = three_sigma {
-        curves.push(Curve { name: "3 sigma".to_owned(), points: series(stamps, bound) });
-    }
+/// Errors over time.
+pub fn error_figure(stamps: &[f64], errors: &[f64], unit: &str) -> Figure {
     let panel = CurvePanel {
         x_label: "time (s)".to_owned(),
         y_label: format!("error ({unit})"),
-        curves,
+        curves: vec![Curve { name: "error".to_owned(), points: series(stamps, errors) }],
         ..Default::default()
     };
     Figure { title: "Error over time".to_owned(), panels: vec![Panel::Curves(panel)], columns: 1 }

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use super::Evaluation;
 use crate::dataset::ReadReport;
-use crate::evaluation::{ApeResult, Statistics};
 use crate::odometry::{OdometryStats, StageTimes};
 
 #[derive(Debug, Clone, Serialize)]
@@ -35,7 +35,7 @@ pub struct Metrics {
     pub stages: BTreeMap<&'static str, StageSummary>,
     /// Length of the estimated path, m.
     pub path_length: f64,
-    /// With a reference: trajectory error after SE(3) alignment.
+    /// With a reference: how far the run is from it.
     pub evaluation: Option<Evaluation>,
     /// Why there is a reference but no evaluation.
     pub evaluation_failure: Option<String>,
@@ -82,34 +82,21 @@ impl Metrics {
             rows.push(("APE RMSE, SE(3) aligned", format!("{position:.4} m")));
             let attitude = evaluation.ape_rotation_deg.rmse;
             rows.push(("attitude error RMSE", format!("{attitude:.3} deg")));
+            if let Some(rpe) = &evaluation.rpe {
+                let (position, attitude) = (rpe.translation.rmse, rpe.rotation_deg.rmse);
+                let text = format!("{position:.4} m, {attitude:.3} deg");
+                rows.push(("RPE RMSE over 1 s", text));
+            }
+            if let Some(nees) = &evaluation.nees {
+                let (attitude, position) = (nees.attitude.mean, nees.position.mean);
+                let text = format!("{attitude:.1} attitude, {position:.1} position (3 expected)");
+                rows.push(("mean NEES", text));
+            }
         }
         if let Some(reason) = &self.evaluation_failure {
             rows.push(("no evaluation", reason.clone()));
         }
         rows
-    }
-}
-
-#[derive(Debug, Clone, Serialize)]
-pub struct Evaluation {
-    pub matched: usize,
-    pub reference_poses: usize,
-    pub estimate_poses: usize,
-    /// Absolute position error, m.
-    pub ape_translation: Statistics,
-    /// Absolute attitude error, degrees.
-    pub ape_rotation_deg: Statistics,
-}
-
-impl Evaluation {
-    pub fn new(translation: &ApeResult, rotation: &ApeResult) -> Self {
-        Self {
-            matched: translation.pairs.len(),
-            reference_poses: translation.pairs.reference_poses,
-            estimate_poses: translation.pairs.estimate_poses,
-            ape_translation: translation.statistics,
-            ape_rotation_deg: rotation.statistics,
-        }
     }
 }
 
@@ -122,37 +109,30 @@ pub struct StageSummary {
     pub max_ms: f64,
 }
 
-/// Times of every frame, by stage.
-#[derive(Debug, Clone, Default)]
-pub struct StageLog {
-    seconds: BTreeMap<&'static str, Vec<f32>>,
+/// Of each stage and of their sum, over the `frames`.
+pub fn stage_summaries(frames: &[StageTimes]) -> BTreeMap<&'static str, StageSummary> {
+    let names = StageTimes::default().stages().map(|(name, _)| name);
+    let of_stage = |k: usize| frames.iter().map(|times| times.stages()[k].1).collect();
+    let total = |times: &StageTimes| times.stages().iter().map(|(_, seconds)| seconds).sum();
+    let stages = names.into_iter().enumerate().map(|(k, name)| (name, of_stage(k)));
+    let total = ("total", frames.iter().map(total).collect());
+    stages.chain([total]).map(|(name, seconds)| (name, StageSummary::of(seconds))).collect()
 }
 
-impl StageLog {
-    pub fn push(&mut self, times: &StageTimes) {
-        let total = times.stages().iter().map(|(_, seconds)| seconds).sum();
-        for (stage, seconds) in times.stages().into_iter().chain([("total", total)]) {
-            self.seconds.entry(stage).or_default().push(seconds as f32);
-        }
-    }
-
-    pub fn summary(&self) -> BTreeMap<&'static str, StageSummary> {
-        let summarize = |values: &Vec<f32>| {
-            let mut sorted = values.clone();
-            sorted.sort_by(f32::total_cmp);
-            // Nearest rank.
-            let quantile = |q: f64| {
-                let rank = (q * sorted.len() as f64).ceil().max(1.0) as usize - 1;
-                1e3 * f64::from(sorted.get(rank).copied().unwrap_or(0.0))
-            };
-            StageSummary {
-                median_ms: quantile(0.5),
-                p95_ms: quantile(0.95),
-                p99_ms: quantile(0.99),
-                max_ms: quantile(1.0),
-            }
+impl StageSummary {
+    fn of(mut seconds: Vec<f64>) -> Self {
+        seconds.sort_unstable_by(f64::total_cmp);
+        // Nearest rank.
+        let quantile = |q: f64| {
+            let rank = (q * seconds.len() as f64).ceil().max(1.0) as usize - 1;
+            1e3 * seconds.get(rank).copied().unwrap_or(0.0)
         };
-        self.seconds.iter().map(|(stage, values)| (*stage, summarize(values))).collect()
+        Self {
+            median_ms: quantile(0.5),
+            p95_ms: quantile(0.95),
+            p99_ms: quantile(0.99),
+            max_ms: quantile(1.0),
+        }
     }
 }
 
@@ -170,15 +150,13 @@ mod tests {
 
     #[test]
     fn quantiles_are_of_nearest_rank() {
-        let mut log = StageLog::default();
-        for k in 1..=100 {
-            log.push(&StageTimes { update: f64::from(k) * 1e-3, ..StageTimes::default() });
-        }
-        let update = log.summary()["update"];
+        let frame = |k| StageTimes { update: f64::from(k) * 1e-3, ..StageTimes::default() };
+        let summaries = stage_summaries(&(1..=100).map(frame).collect::<Vec<_>>());
+        let update = summaries["update"];
         let rounded = |x: f64| (x * 1e3).round() / 1e3;
         assert_eq!(rounded(update.median_ms), 50.0);
         assert_eq!(rounded(update.p95_ms), 95.0);
         assert_eq!(rounded(update.max_ms), 100.0);
-        assert_eq!(rounded(log.summary()["total"].p99_ms), 99.0);
+        assert_eq!(rounded(summaries["total"].p99_ms), 99.0);
     }
 }

@@ -1,5 +1,6 @@
 //! One replay from a log to its files and figures: the library behind `replay` and `demo`.
 
+mod evaluation;
 mod metrics;
 mod navigation;
 mod outputs;
@@ -10,26 +11,25 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Matrix6};
 
-pub use metrics::{Evaluation, Metrics, StageSummary};
+pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors};
+pub use metrics::{Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
 pub use outputs::state_columns;
-pub use report::{Series, report};
+pub use report::{Series, figures, report};
 
 use crate::config::Config;
 use crate::dataset::{self, Log, LogError};
-use crate::evaluation::{
-    Alignment, ApeOptions, AssociationOptions, EvaluationError, Relation, Trajectory, ape,
-    read_trajectory,
-};
-use crate::filter::FilterKind;
+use crate::evaluation::{EvaluationError, Trajectory, read_trajectory};
+use crate::filter::{FilterKind, pose_covariance};
 use crate::inertial::{ImuSample, Stamp};
 use crate::odometry::{
     Event, FrontEnd, Observation, Odometry, RunOptions, StepReport, TruthPose, run,
 };
 use crate::vision::RgbdFrame;
-use metrics::{StageLog, peak_memory_bytes};
+use evaluation::evaluate;
+use metrics::{peak_memory_bytes, stage_summaries};
 use outputs::Outputs;
 
 #[derive(Debug, thiserror::Error)]
@@ -90,8 +90,8 @@ pub trait Observer {
 pub struct Replayed {
     pub metrics: Metrics,
     pub series: Series,
-    pub estimate: Option<Trajectory>,
-    pub reference: Option<Trajectory>,
+    /// With a reference.
+    pub evaluated: Option<Evaluated>,
 }
 
 /// Replays a log. Files in `request.out` are valid whenever it returns, also when it was stopped.
@@ -114,9 +114,9 @@ pub fn replay(
     let mut session = Session {
         outputs: request.out.as_deref().map(Outputs::create).transpose()?,
         failure: None,
-        stages: StageLog::default(),
         series: Series::default(),
         estimate: Vec::new(),
+        covariances: Vec::new(),
         estimate_from_reference: None,
         truth_max_gap: config.truth.max_gap,
     };
@@ -147,18 +147,15 @@ pub fn replay(
     let stats = odometry.stats();
     let estimate = trajectory(&session.estimate);
     let reference = trajectory(&shifted(&truth, config.truth.time_offset));
-    if estimate.is_none() {
+    let Some(estimate) = estimate else {
         let reason = stats.waiting_reason.unwrap_or_else(|| "the log has none".to_owned());
         return Err(ReplayError::NothingProcessed { log: request.log.clone(), reason });
-    }
-    let evaluated = match (&reference, &estimate) {
-        (Some(reference), Some(estimate)) => Some(evaluate(reference, estimate)),
-        _ => None,
     };
-    let (evaluation, evaluation_failure) = match evaluated {
-        Some(Ok(evaluation)) => (Some(evaluation), None),
-        Some(Err(error)) => (None, Some(error.to_string())),
-        None => (None, None),
+    let evaluated =
+        reference.map(|reference| evaluate(&reference, &estimate, &session.covariances));
+    let (evaluated, evaluation_failure) = match evaluated.transpose() {
+        Ok(evaluated) => (evaluated, None),
+        Err(error) => (None, Some(error.to_string())),
     };
     let metrics = Metrics {
         log: request.log.display().to_string(),
@@ -178,28 +175,15 @@ pub fn replay(
         cpu_seconds,
         real_time_factor: span.seconds() / wall_seconds.max(1e-9),
         peak_memory_bytes: peak_memory_bytes(),
-        stages: session.stages.summary(),
+        stages: stage_summaries(&session.series.times),
         path_length: path_length(&session.estimate),
-        evaluation,
+        evaluation: evaluated.as_ref().map(|evaluated| evaluated.summary.clone()),
         evaluation_failure,
     };
     if let Some(directory) = &request.out {
         write_metrics(directory, &metrics)?;
     }
-    Ok(Replayed { metrics, series: session.series, estimate, reference })
-}
-
-/// APE of position and attitude after SE(3) alignment, as `evaluate ape --align se3`.
-fn evaluate(reference: &Trajectory, estimate: &Trajectory) -> Result<Evaluation, EvaluationError> {
-    let options = |relation| ApeOptions {
-        association: AssociationOptions::default(),
-        alignment: Alignment::Se3,
-        align_n: None,
-        relation,
-    };
-    let translation = ape(reference, estimate, &options(Relation::Translation))?;
-    let rotation = ape(reference, estimate, &options(Relation::Angle))?;
-    Ok(Evaluation::new(&translation, &rotation))
+    Ok(Replayed { metrics, series: session.series, evaluated })
 }
 
 fn given_truth(path: &Path) -> Result<std::vec::IntoIter<TruthPose>, ReplayError> {
@@ -296,9 +280,10 @@ impl Iterator for EventSource<'_> {
 struct Session {
     outputs: Option<Outputs>,
     failure: Option<ReplayError>,
-    stages: StageLog,
     series: Series,
     estimate: Vec<TruthPose>,
+    /// Of (rotation, position), one a pose of `estimate`.
+    covariances: Vec<Matrix6<f64>>,
     /// Moves the reference to where the estimate starts; fixed at the first frame that has both.
     estimate_from_reference: Option<Isometry3<f64>>,
     truth_max_gap: f64,
@@ -312,10 +297,10 @@ impl Session {
         odometry: &Odometry,
         observers: &mut [&mut dyn Observer],
     ) {
-        self.stages.push(&report.times);
         self.series.push(report);
         let estimate = report.state.world_from_body;
         self.estimate.push(TruthPose { stamp: report.stamp, world_from_body: estimate });
+        self.covariances.push(pose_covariance(&report.covariance));
         if let (Some(outputs), None) = (&mut self.outputs, &self.failure) {
             self.failure = outputs.step(report).err();
         }

@@ -3,7 +3,7 @@
 use super::Replayed;
 use crate::evaluation::Report;
 use crate::evaluation::{
-    ApeOptions, Cell, EvaluationError, Figure, Table, ape, counts_figure, error_figure,
+    ApeResult, Cell, Figure, Table, belief_figure, counts_figure, error_figure, nees_figure,
     stage_times_figure, trajectory_figure,
 };
 use crate::odometry::{StageTimes, StepReport};
@@ -16,9 +16,6 @@ pub struct Series {
     pub features: Vec<f64>,
     pub matches: Vec<f64>,
     pub inliers: Vec<f64>,
-    pub map_points: Vec<f64>,
-    /// Three standard deviations of the position (root of the covariance's trace), m.
-    pub position_three_sigma: Vec<f64>,
     /// Wall times, s.
     pub times: Vec<StageTimes>,
 }
@@ -29,10 +26,6 @@ impl Series {
         self.features.push(report.counts.features as f64);
         self.matches.push(report.counts.matches as f64);
         self.inliers.push(report.counts.inliers as f64);
-        self.map_points.push(report.counts.map_points as f64);
-        let first = crate::inertial::block::POSITION;
-        let variance: f64 = (first..first + 3).map(|k| report.covariance[(k, k)]).sum();
-        self.position_three_sigma.push(3.0 * variance.max(0.0).sqrt());
         self.times.push(report.times);
     }
 
@@ -44,38 +37,39 @@ impl Series {
     }
 }
 
-/// Report of a replay: figures of the run and, with a reference, of its error.
-pub fn report(replayed: &Replayed) -> Result<Report, EvaluationError> {
-    let series = &replayed.series;
+/// Report of a replay: its figures and the table of results.
+pub fn report(replayed: &Replayed) -> Report {
     let metrics = &replayed.metrics;
-    let mut report = Report {
+    Report {
         title: format!("{}, {}", metrics.log, metrics.filter),
         tables: vec![("Result".to_owned(), result_table(replayed))],
+        figures: figures(replayed).into_iter().map(|(_, figure)| figure).collect(),
         ..Report::default()
-    };
-    report.figures.extend(error_figures(replayed)?);
+    }
+}
+
+/// Names and figures of a replay: of the run and, with a reference, of its error and of how large
+/// that was believed to be.
+pub fn figures(replayed: &Replayed) -> Vec<(&'static str, Figure)> {
+    let mut figures = Vec::new();
+    if let Some(evaluated) = &replayed.evaluated {
+        let ApeResult { pairs, errors, .. } = &evaluated.translation;
+        figures.push(("trajectory", trajectory_figure(pairs, errors, "m")));
+        figures.push(("error", error_figure(&pairs.stamps, errors, "m")));
+        if let Some(result) = &evaluated.consistency {
+            figures.push(("belief", belief_figure(result)));
+            figures.push(("nees", nees_figure(result)));
+        }
+    }
+    let series = &replayed.series;
     let counts = [
         ("features", series.features.clone()),
         ("matches", series.matches.clone()),
         ("inliers", series.inliers.clone()),
     ];
-    report.figures.push(counts_figure(&series.stamps, &counts));
-    report.figures.push(stage_times_figure(&series.stages()));
-    Ok(report)
-}
-
-fn error_figures(replayed: &Replayed) -> Result<Vec<Figure>, EvaluationError> {
-    let (Some(reference), Some(estimate)) = (&replayed.reference, &replayed.estimate) else {
-        return Ok(vec![]);
-    };
-    if replayed.metrics.evaluation.is_none() {
-        return Ok(vec![]);
-    }
-    let result = ape(reference, estimate, &ApeOptions::default())?;
-    Ok(vec![
-        trajectory_figure(&result.pairs, &result.errors, "m"),
-        error_figure(&result.pairs.stamps, &result.errors, "m", None),
-    ])
+    figures.push(("features", counts_figure(&series.stamps, &counts)));
+    figures.push(("timing", stage_times_figure(&series.stages())));
+    figures
 }
 
 fn result_table(replayed: &Replayed) -> Table {
