@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
+use nalgebra::{UnitQuaternion, Vector3};
 use serde_json::Value;
 
 fn evaluate(folder: &Path, arguments: &[&str]) -> Output {
@@ -162,6 +163,101 @@ fn what_is_wrong_is_named() {
     ] {
         failure(path, usage, 2);
     }
+}
+
+/// A body carried through a room: stamp (s), position (m), quaternion.
+fn carried(t: f64) -> (f64, Vector3<f64>, UnitQuaternion<f64>) {
+    let position =
+        Vector3::new(2.0 * (0.7 * t).sin(), 1.5 * (0.9 * t).cos(), 0.4 * (1.3 * t).sin());
+    let turn = Vector3::new(0.8 * t.sin(), 0.7 * (0.6 * t).cos(), 0.9 * (0.8 * t).sin());
+    (t, position, UnitQuaternion::from_scaled_axis(turn))
+}
+
+/// Every classic mistake, made on purpose, is called by its name.
+#[test]
+fn every_guard_names_its_mistake() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let write = |name: &str, mistake: &dyn Fn(f64) -> (f64, Vector3<f64>, [f64; 4])| {
+        let line = |i: u32| {
+            let (t, p, [qx, qy, qz, qw]) = mistake(f64::from(i) * 0.05);
+            format!("{t} {} {} {} {qx} {qy} {qz} {qw}\n", p.x, p.y, p.z)
+        };
+        std::fs::write(path.join(name), (0..600).map(line).collect::<String>()).unwrap();
+    };
+    let right = |t: f64| {
+        let (t, p, q) = carried(t);
+        (t, p, [q.i, q.j, q.k, q.w])
+    };
+    let warnings = |arguments: &[&str]| -> String {
+        let answer = json(path, &[arguments, &["--json"]].concat());
+        answer["warnings"].as_array().unwrap().iter().map(|w| w.as_str().unwrap()).collect()
+    };
+    write("ref.txt", &right);
+    assert_eq!(warnings(&["ape", "ref.txt", "ref.txt", "--align", "yaw"]), "");
+
+    write("sparse.txt", &|t| (if t < 1.0 { t } else { t + 0.02 }, right(t).1, right(t).2));
+    assert!(warnings(&["ape", "ref.txt", "sparse.txt"]).contains("only 20 of 600 poses"));
+
+    write("bridged.txt", &|t| (if t > 10.0 { t + 1.0 } else { t }, right(t).1, right(t).2));
+    let found = warnings(&["ape", "ref.txt", "bridged.txt", "--max-diff", "0.3"]);
+    assert!(found.contains("--max-diff bridges gaps"), "{found}");
+
+    write("nanoseconds.txt", &|t| (1e9 * t, right(t).1, right(t).2));
+    let text = failure(path, &["ape", "ref.txt", "nanoseconds.txt"], 1);
+    assert!(text.contains("the estimate look like nanoseconds"), "{text}");
+
+    write("scalar_first.txt", &|t| {
+        let (t, p, [x, y, z, w]) = right(t);
+        (t, p, [w, x, y, z])
+    });
+    let found = warnings(&["ape", "ref.txt", "scalar_first.txt"]);
+    assert!(found.contains("quaternions of the estimate look as if they were written w x y z"));
+    let found = warnings(&["ape", "scalar_first.txt", "ref.txt"]);
+    assert!(found.contains("quaternions of the reference look as if they were written w x y z"));
+
+    write("inverse.txt", &|t| {
+        let (t, p, [x, y, z, w]) = right(t);
+        (t, p, [-x, -y, -z, w])
+    });
+    assert!(warnings(&["ape", "ref.txt", "inverse.txt"]).contains("inverse rotation"));
+
+    let tilt = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 1.5);
+    write("tilted.txt", &|t| {
+        let (t, p, q) = carried(t);
+        let q = tilt * q;
+        (t, tilt * p, [q.i, q.j, q.k, q.w])
+    });
+    let found = warnings(&["ape", "ref.txt", "tilted.txt", "--align", "yaw"]);
+    assert!(found.contains("tilted by 85.9 deg"), "{found}");
+    assert_eq!(warnings(&["ape", "ref.txt", "tilted.txt", "--align", "se3"]), "");
+
+    write("half.txt", &|t| (right(t).0, 0.5 * right(t).1, right(t).2));
+    let found = warnings(&["ape", "ref.txt", "half.txt"]);
+    assert!(found.contains("fits best when scaled by 2.000"), "{found}");
+
+    write("late.txt", &|t| (right(t).0 + 0.15, right(t).1, right(t).2));
+    let found = warnings(&["ape", "ref.txt", "late.txt"]);
+    assert!(found.contains("--time-offset -0.150"), "{found}");
+}
+
+/// Of two estimates with one stamp OpenVINS compares the second with the next reference pose.
+#[test]
+fn the_association_of_openvins_can_be_chosen() {
+    let folder = folder();
+    let mut twice = std::fs::read_to_string(folder.path().join("ref.txt")).unwrap();
+    let line = twice.lines().nth(20).unwrap().to_owned();
+    twice = twice.replacen(&line, &format!("{line}\n{line}"), 1);
+    std::fs::write(folder.path().join("twice.txt"), twice).unwrap();
+    let largest = |rule: &str| {
+        let arguments = ["ape", "ref.txt", "twice.txt", "--association", rule, "--align", "none"];
+        let arguments = [&arguments[..], &["--max-diff", "0.15", "--json"]].concat();
+        json(folder.path(), &arguments)["max"].as_f64().unwrap()
+    };
+    assert_eq!(largest("nearest"), 0.0);
+    assert!(largest("openvins") > 0.1);
+    let text = failure(folder.path(), &["ape", "ref.txt", "est.txt", "--association", "best"], 2);
+    assert!(text.contains("nearest, openvins"), "{text}");
 }
 
 #[test]

@@ -8,9 +8,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand, ValueEnum};
 use mfg_vio::evaluation::{
-    self, Alignment, ApeOptions, AssociationOptions, Cell, Delta, EvaluationError, Figure,
-    NeesOptions, NeesSummary, Relation, Report, RpeOptions, Similarity, Statistics,
-    SubTrajectoryError, Table, TrajectoryFile, TrajectoryFormat, write_html,
+    self, Alignment, ApeOptions, AssociationOptions, AssociationRule, Cell, Delta, EvaluationError,
+    Figure, NeesOptions, NeesSummary, PosePairs, Relation, Report, RpeOptions, Similarity,
+    Statistics, SubTrajectoryError, Table, Trajectory, TrajectoryFile, TrajectoryFormat,
+    write_html,
 };
 use rayon::prelude::*;
 use serde::Serialize;
@@ -158,6 +159,9 @@ struct Inputs {
     /// Part of the pose error: translation (m) or rotation angle (degrees)
     #[arg(long, value_enum, default_value = "trans")]
     relation: RelationArg,
+    /// Recording of the trajectories for the Rerun viewer
+    #[arg(long, value_name = "FILE")]
+    rrd: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
@@ -168,6 +172,9 @@ struct Matching {
     /// Largest time difference of poses that are compared, s
     #[arg(long, value_name = "S", default_value_t = 0.01, value_parser = non_negative)]
     max_diff: f64,
+    /// Which pose is compared with which
+    #[arg(long, value_enum, default_value = "nearest")]
+    association: AssociationArg,
     /// Added to the stamps of the estimate, s; auto: found from angular rates
     #[arg(
         long,
@@ -239,6 +246,23 @@ impl From<RelationArg> for Relation {
     }
 }
 
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum AssociationArg {
+    /// With the nearest in time, as evo does
+    Nearest,
+    /// With the nearest that no earlier pose has taken, as OpenVINS does
+    Openvins,
+}
+
+impl From<AssociationArg> for AssociationRule {
+    fn from(value: AssociationArg) -> Self {
+        match value {
+            AssociationArg::Nearest => Self::Nearest,
+            AssociationArg::Openvins => Self::OpenVins,
+        }
+    }
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, ValueEnum)]
 enum UnitArg {
     F,
@@ -306,7 +330,7 @@ struct EstimateReport {
     warnings: Vec<String>,
 }
 
-#[derive(Serialize)]
+#[derive(Clone, Serialize)]
 #[serde(untagged)]
 enum Kind {
     Absolute {
@@ -322,7 +346,7 @@ enum Kind {
     },
 }
 
-#[derive(Serialize)]
+#[derive(Clone, Serialize)]
 struct SubTrajectory {
     length: f64,
     pairs: usize,
@@ -355,61 +379,47 @@ struct Presentation {
     figures: Vec<Figure>,
 }
 
+/// An estimate that was compared with the reference.
+struct Compared {
+    /// The matched poses, the estimate's aligned.
+    pairs: PosePairs,
+    alignment: Similarity,
+    /// Stamps of the errors, s.
+    stamps: Vec<f64>,
+    errors: Vec<f64>,
+    statistics: Statistics,
+    kind: Kind,
+    warnings: Vec<String>,
+    /// To be shown before the error over time.
+    figures: Vec<Figure>,
+}
+
 fn ape(args: &ApeArgs) -> anyhow::Result<()> {
     let inputs = &args.inputs;
     let alignment = Alignment::from(args.align);
-    let (reference, estimates) = inputs.read()?;
-    let mut reports = Vec::new();
-    let mut figures = Vec::new();
-    let mut groups = Vec::new();
-    let mut names = short_names(&inputs.estimates).into_iter();
-    for (path, estimate) in inputs.estimates.iter().zip(&estimates) {
-        let options = ApeOptions {
-            association: inputs.matching.association(path, &reference, estimate)?,
-            alignment,
-            align_n: inputs.matching.align_n.map(NonZeroUsize::get),
-            relation: inputs.relation.into(),
-        };
-        let (file, name) = (path.display().to_string(), names.next().unwrap_or_default());
-        let (reference, estimate) = (&reference.trajectory, &estimate.trajectory);
-        let pairs = evaluation::associate(reference, estimate, &options.association)
-            .with_context(|| file.clone())?;
-        let suspicions = evaluation::suspicions(reference, estimate, &pairs, &options);
-        let scale_check = args.scale_check.then(|| evaluation::similarity_scale(&pairs));
-        let result = evaluation::ape_of_pairs(pairs, alignment, options.align_n, options.relation)
-            .with_context(|| file.clone())?;
-        if args.output.draws() {
-            let unit = options.relation.unit();
-            figures.push(
-                evaluation::trajectory_figure(&result.pairs, &result.errors, unit).titled(&name),
-            );
-            let stamps = &result.pairs.stamps;
-            figures
-                .push(evaluation::error_figure(stamps, &result.errors, unit, None).titled(&name));
-            groups.push((name, result.errors));
-        }
-        reports.push(EstimateReport {
-            file,
-            matched: result.pairs.len(),
-            reference_poses: result.pairs.reference_poses,
-            estimate_poses: result.pairs.estimate_poses,
-            relation: options.relation.name(),
-            unit: options.relation.unit(),
-            statistics: result.statistics,
-            alignment: result.alignment,
-            time_offset: options.association.time_offset,
-            kind: Kind::Absolute { scale_check },
-            warnings: suspicions.iter().map(ToString::to_string).collect(),
-        });
-    }
     let relation = Relation::from(inputs.relation);
     let title = format!("Absolute pose error ({}), {alignment} alignment", relation.unit());
-    if groups.len() > 1 {
-        let all =
-            evaluation::groups_figure(&title, &format!("error ({})", relation.unit()), groups);
-        figures.insert(0, all);
-    }
-    let mut presentation = present(title, &inputs.reference, &reports, figures)?;
+    let compare = |reference: &Trajectory, estimate: &Trajectory, association| {
+        let align_n = inputs.matching.align_n.map(NonZeroUsize::get);
+        let options = ApeOptions { association, alignment, align_n, relation };
+        let pairs = evaluation::associate(reference, estimate, &association)?;
+        let suspicions = evaluation::suspicions(reference, estimate, &pairs, &options);
+        let scale_check = args.scale_check.then(|| evaluation::similarity_scale(&pairs));
+        let result = evaluation::ape_of_pairs(pairs, alignment, align_n, relation)?;
+        let figure =
+            || evaluation::trajectory_figure(&result.pairs, &result.errors, relation.unit());
+        Ok(Compared {
+            figures: args.output.draws().then(figure).into_iter().collect(),
+            stamps: result.pairs.stamps.clone(),
+            pairs: result.pairs,
+            alignment: result.alignment,
+            errors: result.errors,
+            statistics: result.statistics,
+            kind: Kind::Absolute { scale_check },
+            warnings: suspicions.iter().map(ToString::to_string).collect(),
+        })
+    };
+    let (mut presentation, reports) = inputs.compare(title, &args.output, compare)?;
     if args.scale_check {
         presentation.tables.push(("Scale of Sim(3) alignment".to_owned(), scale_table(&reports)));
     }
@@ -426,75 +436,137 @@ fn rpe(args: &RpeArgs) -> anyhow::Result<()> {
         UnitArg::Deg if args.delta <= 180.0 => Delta::Degrees(args.delta),
         UnitArg::Deg => wrong_usage(format!("--delta {}: an angle is at most 180", args.delta)),
     };
-    let (reference, estimates) = inputs.read()?;
-    let mut reports = Vec::new();
-    let mut figures = Vec::new();
-    let mut groups = Vec::new();
-    let mut names = short_names(&inputs.estimates).into_iter();
-    for (path, estimate) in inputs.estimates.iter().zip(&estimates) {
+    let relation = Relation::from(inputs.relation);
+    let (unit, kind) = (relation.unit(), if args.all_pairs { "all" } else { "consecutive" });
+    let title =
+        format!("Relative pose error ({unit}) over {} {}, {kind} pairs", args.delta, delta.unit());
+    let compare = |reference: &Trajectory, estimate: &Trajectory, association| {
         let options = RpeOptions {
-            association: inputs.matching.association(path, &reference, estimate)?,
+            association,
             alignment: args.align.into(),
             align_n: inputs.matching.align_n.map(NonZeroUsize::get),
-            relation: inputs.relation.into(),
+            relation,
             delta,
             all_pairs: args.all_pairs,
         };
-        let (file, name) = (path.display().to_string(), names.next().unwrap_or_default());
-        let (reference, estimate) = (&reference.trajectory, &estimate.trajectory);
-        let result =
-            evaluation::rpe(reference, estimate, &options).with_context(|| file.clone())?;
-        let lengths = evaluation::sub_trajectory_errors(&result.pairs, &args.lengths)
-            .with_context(|| file.clone())?;
-        let mut warnings = Vec::new();
-        for length in &args.lengths {
-            if !lengths.iter().any(|error| error.length == *length) {
-                warnings.push(format!("the reference has no sub-trajectory of {length} m"));
-            }
-        }
-        if args.output.draws() {
-            if !lengths.is_empty() {
-                figures.push(evaluation::relative_error_figure(&lengths).titled(&name));
-            }
-            let ends: Vec<f64> = result
-                .links
-                .iter()
-                .filter_map(|&(_, j)| result.pairs.stamps.get(j).copied())
-                .collect();
-            let unit = options.relation.unit();
-            figures.push(evaluation::error_figure(&ends, &result.errors, unit, None).titled(&name));
-            groups.push((name, result.errors));
-        }
-        reports.push(EstimateReport {
-            file,
-            matched: result.pairs.len(),
-            reference_poses: result.pairs.reference_poses,
-            estimate_poses: result.pairs.estimate_poses,
-            relation: options.relation.name(),
-            unit: options.relation.unit(),
-            statistics: result.statistics,
+        let result = evaluation::rpe(reference, estimate, &options)?;
+        let lengths = evaluation::sub_trajectory_errors(&result.pairs, &args.lengths)?;
+        let absent = |length: &&f64| !lengths.iter().any(|error| error.length == **length);
+        let warn = |length: &f64| format!("the reference has no sub-trajectory of {length} m");
+        let figure = || evaluation::relative_error_figure(&lengths);
+        let draws = args.output.draws() && !lengths.is_empty();
+        let stamps = result.links.iter().filter_map(|&(_, j)| result.pairs.stamps.get(j).copied());
+        Ok(Compared {
+            figures: draws.then(figure).into_iter().collect(),
+            stamps: stamps.collect(),
+            pairs: result.pairs,
             alignment: result.alignment,
-            time_offset: options.association.time_offset,
+            errors: result.errors,
+            statistics: result.statistics,
+            warnings: args.lengths.iter().filter(absent).map(warn).collect(),
             kind: Kind::Relative {
                 pairs: result.links.len(),
                 sub_trajectories: lengths.iter().map(Into::into).collect(),
             },
-            warnings,
-        });
-    }
-    let unit = Relation::from(inputs.relation).unit();
-    let pairs = if args.all_pairs { "all pairs" } else { "consecutive pairs" };
-    let title =
-        format!("Relative pose error ({unit}) over {} {}, {pairs}", args.delta, delta.unit());
-    if groups.len() > 1 {
-        figures.insert(0, evaluation::groups_figure(&title, &format!("error ({unit})"), groups));
-    }
-    let mut presentation = present(title, &inputs.reference, &reports, figures)?;
+        })
+    };
+    let (mut presentation, reports) = inputs.compare(title, &args.output, compare)?;
     if !args.lengths.is_empty() {
         let table = sub_trajectory_table(&reports);
         presentation.tables.push(("Error over sub-trajectories".to_owned(), table));
     }
     args.output.emit(&presentation)
+}
+
+impl Inputs {
+    /// Compares every estimate with the reference, records and gathers what is to be shown.
+    fn compare(
+        &self,
+        title: String,
+        output: &Output,
+        compare: impl Fn(
+            &Trajectory,
+            &Trajectory,
+            AssociationOptions,
+        ) -> Result<Compared, EvaluationError>,
+    ) -> anyhow::Result<(Presentation, Vec<EstimateReport>)> {
+        let relation = Relation::from(self.relation);
+        let unit = relation.unit();
+        let (reference, estimates) = self.read()?;
+        let names = short_names(&self.estimates);
+        let mut reports = Vec::new();
+        let mut compared = Vec::new();
+        for (path, estimate) in self.estimates.iter().zip(&estimates) {
+            let association = self.matching.association(path, &reference, estimate)?;
+            let file = path.display().to_string();
+            let case = compare(&reference.trajectory, &estimate.trajectory, association)
+                .with_context(|| file.clone())?;
+            reports.push(EstimateReport {
+                file,
+                matched: case.pairs.len(),
+                reference_poses: case.pairs.reference_poses,
+                estimate_poses: case.pairs.estimate_poses,
+                relation: relation.name(),
+                unit,
+                statistics: case.statistics,
+                alignment: case.alignment,
+                time_offset: association.time_offset,
+                kind: case.kind.clone(),
+                warnings: case.warnings.clone(),
+            });
+            compared.push((association.time_offset, case));
+        }
+        if let Some(path) = &self.rrd {
+            let estimates = names.iter().zip(&compared);
+            let estimates = estimates.map(|(name, (offset, case))| (name.as_str(), *offset, case));
+            record(path, &title, unit, &reference.trajectory, estimates)?;
+        }
+        let mut figures = Vec::new();
+        if output.draws() {
+            let mut groups = Vec::new();
+            for (name, (_, case)) in names.into_iter().zip(compared) {
+                let over_time = evaluation::error_figure(&case.stamps, &case.errors, unit);
+                let all = case.figures.into_iter().chain([over_time]);
+                figures.extend(all.map(|figure| figure.titled(&name)));
+                groups.push((name, case.errors));
+            }
+            if groups.len() > 1 {
+                let label = format!("error ({unit})");
+                figures.insert(0, evaluation::groups_figure(&title, &label, groups));
+            }
+        }
+        Ok((present(title, &self.reference, &reports, figures)?, reports))
+    }
+}
+
+#[cfg(feature = "viewer")]
+fn record<'a>(
+    path: &Path,
+    title: &str,
+    unit: &str,
+    reference: &Trajectory,
+    estimates: impl Iterator<Item = (&'a str, f64, &'a Compared)>,
+) -> anyhow::Result<()> {
+    use mfg_vio::viewer::{ComparedEstimate, record_comparison};
+
+    let estimates: Vec<_> = estimates
+        .map(|(name, time_offset, case)| {
+            let Compared { pairs, stamps, errors, .. } = case;
+            ComparedEstimate { name, pairs, time_offset, stamps, errors }
+        })
+        .collect();
+    Ok(record_comparison(path, title, unit, reference, &estimates)?)
+}
+
+#[cfg(not(feature = "viewer"))]
+fn record<'a>(
+    path: &Path,
+    _: &str,
+    _: &str,
+    _: &Trajectory,
+    _: impl Iterator<Item = (&'a str, f64, &'a Compared)>,
+) -> anyhow::Result<()> {
+    bail!("{}: this program was built without the feature `viewer`", path.display())
 }
 
 fn present(
@@ -584,14 +656,7 @@ fn nees(args: &NeesArgs) -> anyhow::Result<()> {
         false => args.directory.clone(),
     };
     let estimate = evaluation::read_believed_trajectory(&path)?;
-    let association = match args.matching.time_offset {
-        TimeOffset::Fixed(time_offset) => {
-            AssociationOptions { max_diff: args.matching.max_diff, time_offset }
-        }
-        TimeOffset::Auto => {
-            args.matching.found_offset(&path, &reference.trajectory, &estimate.trajectory)?
-        }
-    };
+    let association = args.matching.options(&path, &reference.trajectory, &estimate.trajectory)?;
     let options = NeesOptions {
         association,
         alignment: args.align.into(),
@@ -788,28 +853,32 @@ impl Matching {
         reference: &TrajectoryFile,
         estimate: &TrajectoryFile,
     ) -> anyhow::Result<AssociationOptions> {
-        match self.time_offset {
-            TimeOffset::Fixed(time_offset) => {
-                Ok(AssociationOptions { max_diff: self.max_diff, time_offset })
-            }
-            TimeOffset::Auto if estimate.format == TrajectoryFormat::Kitti => {
-                bail!("{}: KITTI poses have no stamps to find --time-offset from", path.display())
-            }
-            TimeOffset::Auto => {
-                self.found_offset(path, &reference.trajectory, &estimate.trajectory)
-            }
+        let without_stamps = estimate.format == TrajectoryFormat::Kitti;
+        if without_stamps && matches!(self.time_offset, TimeOffset::Auto) {
+            bail!("{}: KITTI poses have no stamps to find --time-offset from", path.display());
         }
+        self.options(path, &reference.trajectory, &estimate.trajectory)
     }
 
-    fn found_offset(
+    fn options(
         &self,
         path: &Path,
-        reference: &evaluation::Trajectory,
-        estimate: &evaluation::Trajectory,
+        reference: &Trajectory,
+        estimate: &Trajectory,
     ) -> anyhow::Result<AssociationOptions> {
-        let offset = evaluation::estimate_clock_offset(reference, estimate)
-            .with_context(|| path.display().to_string())?;
-        Ok(AssociationOptions { max_diff: self.max_diff, time_offset: offset.seconds })
+        let time_offset = match self.time_offset {
+            TimeOffset::Fixed(seconds) => seconds,
+            TimeOffset::Auto => {
+                evaluation::estimate_clock_offset(reference, estimate)
+                    .with_context(|| path.display().to_string())?
+                    .seconds
+            }
+        };
+        Ok(AssociationOptions {
+            rule: self.association.into(),
+            max_diff: self.max_diff,
+            time_offset,
+        })
     }
 }
 
