@@ -83,7 +83,8 @@ mod tests {
         covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&(root * root.transpose()));
         let mut belief = Belief { state, covariance };
         let attitude = belief.attitude().unwrap();
-        assert!(attitude.mode().angle_to(&rotation.to_rotation_matrix()) < 1e-9);
+        let mode = rotation.to_rotation_matrix();
+        assert_relative_eq!(attitude.mode().matrix(), mode.matrix(), epsilon = 1e-12);
         assert_relative_eq!(
             attitude.information() * root * root.transpose(),
             Matrix3::identity(),

@@ -215,12 +215,8 @@ pub(super) fn frame(frame: u64) -> (StepReport, RgbdFrame) {
 }
 
 fn record(path: &Path, frames: u64, config: &RecordingConfig) -> Result<(), ViewerError> {
-    record_into(Sink::File(path.to_owned()), frames, config)
-}
-
-fn record_into(sink: Sink, frames: u64, config: &RecordingConfig) -> Result<(), ViewerError> {
     let contents = Contents { name: "walk".to_owned(), truth: true, imu: true };
-    let mut recorder = Recorder::new(&[sink], &contents, config)?;
+    let mut recorder = Recorder::new(&[Sink::File(path.to_owned())], &contents, config)?;
     recorder.camera(&CAMERA, &Walk::imu_from_camera(), SIZE);
     let mut walk = Walk::new();
     let mut samples = 0;
@@ -373,19 +369,4 @@ fn sinks_that_cannot_be_opened_are_named() {
     let unreachable = error(&[Sink::Connect(silent)]);
     assert!(unreachable.contains("127.0.0.1:9/proxy within"), "{unreachable}");
     error(&[]);
-}
-
-/// `MFG_VIO_RRD=walk.rrd [MFG_VIO_FRAMES=9000] cargo test --lib viewer -- --ignored`, then open it;
-/// or `MFG_VIO_RRD=rerun+http://127.0.0.1:9876/proxy` for a viewer that is open.
-#[test]
-#[ignore = "writes a recording to look at"]
-fn write_a_recording_to_look_at() {
-    let target = std::env::var("MFG_VIO_RRD").unwrap();
-    let frames = std::env::var("MFG_VIO_FRAMES").map_or(600, |frames| frames.parse().unwrap());
-    let sink = if target.starts_with("rerun+") {
-        Sink::Connect(target)
-    } else {
-        Sink::File(target.into())
-    };
-    record_into(sink, frames, &RecordingConfig::default()).unwrap();
 }
