@@ -36,9 +36,9 @@ pub use figures::{
     stage_times_figure, trajectory_figure,
 };
 pub use guards::{Convention, Suspicion, Which, similarity_scale, suspicions};
-pub(crate) use nees::normalised_square;
 pub use nees::{
-    BelievedTrajectory, NeesOptions, NeesResult, NeesSummary, nees, read_believed_trajectory,
+    BelievedTrajectory, NeesOptions, NeesResult, NeesSummary, nees, normalised_square,
+    read_believed_trajectory,
 };
 pub use plot::{Band, BoxPanel, Curve, CurvePanel, Figure, Panel, PathPanel, PlotError};
 pub use relative::{Delta, RpeOptions, RpeResult, rpe};

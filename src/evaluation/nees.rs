@@ -278,7 +278,7 @@ impl Series {
 }
 
 /// `e^T P^-1 e`; `None` unless `P` is positive definite.
-pub(crate) fn normalised_square<const N: usize>(
+pub fn normalised_square<const N: usize>(
     error: &SVector<f64, N>,
     covariance: SMatrix<f64, N, N>,
 ) -> Option<f64> {
