@@ -9,7 +9,9 @@
 //!    vectors, wrapped around SO(3).
 //! 4. [`matrix_fisher_gaussian`]: attitude and vector together, correlated;
 //!    [`BinghamGaussian`] is its twin on quaternions.
-//! 5. [`unscented`]: a handful of weighted points that stand for any of these.
+//! 5. [`rotation_quadratic`], [`regression`]: what Gaussian measurements make of these.
+//! 6. [`unscented`]: a handful of weighted points that stand for any of these; [`progressive`]
+//!    updates with them.
 //!
 //! Densities are with respect to the uniform distribution on the rotations (spheres) and to
 //! Lebesgue measure on vectors. Short names of sources: **W22**, W. Wang, *Matrix Fisher-Gaussian
@@ -24,6 +26,9 @@ mod circle;
 mod concentrated_gaussian;
 pub mod matrix_fisher;
 pub mod matrix_fisher_gaussian;
+pub mod progressive;
+pub mod regression;
+pub mod rotation_quadratic;
 pub mod unscented;
 mod von_mises_fisher;
 

@@ -59,6 +59,13 @@ impl Correlation {
         }
     }
 
+    /// The 3x9 matrix `L` with `v_R = L vec R` for this distribution of the attitude.
+    pub fn regression(self, attitude: &MatrixFisher) -> SMatrix<f64, 3, 9> {
+        let ProperSvd { u, s, v } = attitude.svd();
+        let central = v.matrix().transpose().kronecker(&u.matrix().transpose());
+        self.central_regression(s) * central
+    }
+
     /// The 3x9 matrix `L` with `v_R = L vec Q`, columns stacked.
     fn central_regression(self, s: &Vector3<f64>) -> SMatrix<f64, 3, 9> {
         let mut l = SMatrix::zeros();
@@ -227,9 +234,7 @@ where
 
     /// The 3x9 matrix `L` with `v_R = L vec R`, columns stacked.
     pub fn regression(&self) -> SMatrix<f64, 3, 9> {
-        let ProperSvd { u, s, v } = self.attitude.svd();
-        let central = v.matrix().transpose().kronecker(&u.matrix().transpose());
-        self.correlation.central_regression(s) * central
+        self.correlation.regression(&self.attitude)
     }
 
     /// `E[x | R] = mu + P v_R` (3.2).
