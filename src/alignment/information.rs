@@ -1,5 +1,10 @@
 use nalgebra::{Matrix3, Matrix6, Rotation3, SMatrix, SVector, Vector3, Vector6};
 
+use crate::distribution::regression::{JointInformation, RotationRegression};
+use crate::distribution::rotation_quadratic::{
+    RotationQuadratic, rotated_vector_by_rotation, vectorize,
+};
+
 /// A point measured in the body frame and the map point it was matched to.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointPair {
@@ -14,13 +19,30 @@ pub struct PointPair {
 }
 
 impl PointPair {
-    /// `(R A R^T + B)^-1`; `None` if that covariance is not positive definite.
-    fn weight(&self, world_from_body: &Matrix3<f64>) -> Option<Matrix3<f64>> {
-        let rotated = world_from_body * self.body_covariance * world_from_body.transpose();
-        let cholesky = (rotated + self.world_covariance).cholesky()?;
-        let weight = cholesky.inverse();
-        weight.iter().all(|x| x.is_finite()).then_some(weight)
+    /// Whether the measurement's covariance is the same whatever the attitude, up to rounding.
+    pub fn is_isotropic_in_body(&self) -> bool {
+        let a = &self.body_covariance;
+        (a - Matrix3::identity() * a[(0, 0)]).amax() <= 1e-12 * a[(0, 0)]
     }
+
+    /// `(R A R^T + B)^-1`; `None` if that covariance is not positive definite.
+    pub(crate) fn weight(&self, world_from_body: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+        let rotated = world_from_body * self.body_covariance * world_from_body.transpose();
+        inverse_of_positive(&(rotated + self.world_covariance))
+    }
+}
+
+/// Inverse of a symmetric matrix by its cofactors; `None` unless it is positive definite.
+fn inverse_of_positive(m: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+    let (a, b, c) = (m[(0, 0)], m[(0, 1)], m[(0, 2)]);
+    let (d, e, f) = (m[(1, 1)], m[(1, 2)], m[(2, 2)]);
+    let (aa, ab, ac) = (d * f - e * e, c * e - b * f, b * e - c * d);
+    let (bb, bc, cc) = (a * f - c * c, b * c - a * e, a * d - b * b);
+    let determinant = a * aa + b * ab + c * ac;
+    // An infinite or undefined entry makes one of these false.
+    let positive = a > 0.0 && cc > 0.0 && determinant > 0.0 && determinant.is_finite();
+    let inverse = Matrix3::new(aa, ab, ac, ab, bb, bc, ac, bc, cc) / determinant;
+    (positive && inverse.iter().all(|x| x.is_finite())).then_some(inverse)
 }
 
 /// Down-weighting of residuals that the Gaussian model does not explain.
@@ -55,11 +77,8 @@ pub struct PoseInformation {
     /// World position that `t` is relative to; near the body, so that far-off worlds cost no
     /// digits.
     pub origin: Vector3<f64>,
-    pub rr: SMatrix<f64, 9, 9>,
-    pub rt: SMatrix<f64, 9, 3>,
-    pub tt: Matrix3<f64>,
-    pub eta_r: SVector<f64, 9>,
-    pub eta_t: Vector3<f64>,
+    /// Information matrix and vector of `(r, t)`.
+    pub joint: JointInformation,
     /// The form at `r = 0`, `t = 0`.
     pub constant: f64,
     /// Number of pairs that entered.
@@ -69,7 +88,7 @@ pub struct PoseInformation {
 impl PoseInformation {
     /// Accumulates `pairs` with the weights taken at the pose (`world_from_body`, `position`).
     ///
-    /// Pairs without a positive definite covariance are left out. `O(N)`, no allocation.
+    /// Pairs without a positive definite covariance or finite coordinates are left out. `O(N)`, no allocation.
     pub fn accumulate(
         pairs: &[PointPair],
         world_from_body: &Rotation3<f64>,
@@ -78,11 +97,13 @@ impl PoseInformation {
     ) -> Self {
         let mut sum = Self {
             origin: *position,
-            rr: SMatrix::zeros(),
-            rt: SMatrix::zeros(),
-            tt: Matrix3::zeros(),
-            eta_r: SVector::zeros(),
-            eta_t: Vector3::zeros(),
+            joint: JointInformation {
+                rr: SMatrix::zeros(),
+                rx: SMatrix::zeros(),
+                xx: Matrix3::zeros(),
+                eta_r: SVector::zeros(),
+                eta_x: Vector3::zeros(),
+            },
             constant: 0.0,
             points: 0,
         };
@@ -91,7 +112,9 @@ impl PoseInformation {
                 let target = pair.in_world - position;
                 let residual = world_from_body * pair.in_body - target;
                 let distance = residual.dot(&(weight * residual));
-                sum.add(&pair.in_body, &target, &(weight * kernel.weight(distance)));
+                if distance.is_finite() {
+                    sum.add(&pair.in_body, &target, &(weight * kernel.weight(distance)));
+                }
             }
         }
         sum
@@ -102,20 +125,20 @@ impl PoseInformation {
         for a in 0..3 {
             for b in a..3 {
                 let block = weight * (in_body[a] * in_body[b]);
-                let mut upper = self.rr.fixed_view_mut::<3, 3>(3 * a, 3 * b);
+                let mut upper = self.joint.rr.fixed_view_mut::<3, 3>(3 * a, 3 * b);
                 upper += block;
                 if a != b {
-                    let mut lower = self.rr.fixed_view_mut::<3, 3>(3 * b, 3 * a);
+                    let mut lower = self.joint.rr.fixed_view_mut::<3, 3>(3 * b, 3 * a);
                     lower += block;
                 }
             }
-            let mut rt = self.rt.fixed_view_mut::<3, 3>(3 * a, 0);
-            rt += weight * in_body[a];
-            let mut eta = self.eta_r.fixed_rows_mut::<3>(3 * a);
+            let mut rx = self.joint.rx.fixed_view_mut::<3, 3>(3 * a, 0);
+            rx += weight * in_body[a];
+            let mut eta = self.joint.eta_r.fixed_rows_mut::<3>(3 * a);
             eta += weighted * in_body[a];
         }
-        self.tt += weight;
-        self.eta_t += weighted;
+        self.joint.xx += weight;
+        self.joint.eta_x += weighted;
         self.constant += target.dot(&weighted);
         self.points += 1;
     }
@@ -124,9 +147,26 @@ impl PoseInformation {
     pub fn cost(&self, world_from_body: &Rotation3<f64>, position: &Vector3<f64>) -> f64 {
         let r = vectorize(world_from_body.matrix());
         let t = position - self.origin;
-        r.dot(&(self.rr * r)) + 2.0 * r.dot(&(self.rt * t)) + t.dot(&(self.tt * t))
-            - 2.0 * (self.eta_r.dot(&r) + self.eta_t.dot(&t))
+        r.dot(&(self.joint.rr * r))
+            + 2.0 * r.dot(&(self.joint.rx * t))
+            + t.dot(&(self.joint.xx * t))
+            - 2.0 * (self.joint.eta_r.dot(&r) + self.joint.eta_x.dot(&t))
             + self.constant
+    }
+
+    /// The density of `(R, t)` that the likelihood is without a prior (W22 theorem 5.3): the
+    /// marginal of `R`, and `t | R`. Isotropic weights make the marginal matrix Fisher, exactly.
+    /// `None` without points.
+    pub fn density(&self) -> Option<RotationRegression<3>> {
+        let joint = &self.joint;
+        let covariance = joint.xx.cholesky()?.inverse();
+        let offset = covariance * joint.eta_x;
+        let slope = -(covariance * joint.rx.transpose());
+        let attitude = RotationQuadratic {
+            linear: joint.eta_r - joint.rx * offset,
+            quadratic: joint.rr + joint.rx * slope,
+        };
+        Some(RotationRegression { attitude, offset, slope, covariance })
     }
 
     /// Information matrix and vector of `(e, t)` with `R = world_from_body exp(e^)`, linearised
@@ -135,31 +175,20 @@ impl PoseInformation {
         let r = vectorize(world_from_body.matrix());
         let d = rotated_vector_by_rotation(world_from_body.matrix());
         let mut information = Matrix6::<f64>::zeros();
-        let et = d.transpose() * self.rt;
-        information.fixed_view_mut::<3, 3>(0, 0).copy_from(&(d.transpose() * self.rr * d));
+        let et = d.transpose() * self.joint.rx;
+        information.fixed_view_mut::<3, 3>(0, 0).copy_from(&(d.transpose() * self.joint.rr * d));
         information.fixed_view_mut::<3, 3>(0, 3).copy_from(&et);
         information.fixed_view_mut::<3, 3>(3, 0).copy_from(&et.transpose());
-        information.fixed_view_mut::<3, 3>(3, 3).copy_from(&self.tt);
+        information.fixed_view_mut::<3, 3>(3, 3).copy_from(&self.joint.xx);
         let mut vector = Vector6::zeros();
-        vector.fixed_rows_mut::<3>(0).copy_from(&(d.transpose() * (self.eta_r - self.rr * r)));
-        vector.fixed_rows_mut::<3>(3).copy_from(&(self.eta_t - self.rt.transpose() * r));
+        vector
+            .fixed_rows_mut::<3>(0)
+            .copy_from(&(d.transpose() * (self.joint.eta_r - self.joint.rr * r)));
+        vector
+            .fixed_rows_mut::<3>(3)
+            .copy_from(&(self.joint.eta_x - self.joint.rx.transpose() * r));
         (information, vector)
     }
-}
-
-/// `vec(R)`: the columns of a matrix, stacked.
-pub fn vectorize(matrix: &Matrix3<f64>) -> SVector<f64, 9> {
-    SVector::from_column_slice(matrix.as_slice())
-}
-
-/// Derivative of `vec(R exp(e^))` by `e` at `e = 0` (9x3).
-pub fn rotated_vector_by_rotation(rotation: &Matrix3<f64>) -> SMatrix<f64, 9, 3> {
-    let mut derivative = SMatrix::<f64, 9, 3>::zeros();
-    for k in 0..3 {
-        let turned = rotation * Vector3::ith(k, 1.0).cross_matrix();
-        derivative.set_column(k, &vectorize(&turned));
-    }
-    derivative
 }
 
 #[cfg(test)]
@@ -238,6 +267,28 @@ mod tests {
                 prop_assert!((slope - vector[k]).abs() < 1e-6 * scale, "{k}: {slope} {}", vector[k]);
             }
             prop_assert!((information - information.transpose()).norm() < 1e-9 * information.norm());
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn cofactors_give_the_inverse(m in covariance()) {
+            let product = inverse_of_positive(&m).unwrap() * m;
+            prop_assert!((product - Matrix3::identity()).norm() < 1e-10);
+        }
+    }
+
+    #[test]
+    fn what_is_not_positive_definite_has_no_weight() {
+        let broken = [
+            Matrix3::zeros(),
+            Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0)),
+            Matrix3::from_diagonal(&Vector3::new(-1.0, -1.0, 1.0)),
+            Matrix3::identity() * f64::NAN,
+            Matrix3::identity() * f64::INFINITY,
+        ];
+        for m in broken {
+            assert_eq!(inverse_of_positive(&m), None);
         }
     }
 
