@@ -6,11 +6,12 @@ mod bayes;
 pub mod gnss;
 mod visual;
 
+pub use crate::alignment::MapEstimate;
 pub use bayes::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep,
     PositionMeasurement, VectorEstimate, VectorMeasurement,
 };
 pub use visual::{
-    FilterConfig, FilterKind, MapEstimate, MapTreatment, Mekf, MfgFilter, UpdateOutcome,
-    VisualInertialFilter, point_by_pose, pose_covariance,
+    FilterConfig, FilterKind, MapTreatment, Mekf, MfgFilter, Screening, UpdateMethod,
+    UpdateOutcome, VisualInertialFilter, point_by_pose, pose_covariance,
 };

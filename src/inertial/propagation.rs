@@ -1,7 +1,7 @@
-use nalgebra::{Isometry3, Matrix3, SMatrix, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Matrix6, SMatrix, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{Belief, ImuConfig, ImuSample, NavCovariance, block};
+use super::{Belief, ImuConfig, ImuSample, NavCovariance, NavState, block};
 use crate::so3;
 
 /// What carries the belief between two camera frames.
@@ -97,6 +97,38 @@ impl Propagator {
         }
     }
 
+    /// Motion of the body over the interval relative to its pose at the start and without
+    /// gravity, its error being caused by the noises and by biases of the given means and
+    /// covariance: what a start at the identity, at rest, would lead to. `None` if it is not
+    /// finite.
+    pub fn relative_motion(
+        &self,
+        gyro: &Vector3<f64>,
+        accel: &Vector3<f64>,
+        biases: &NavState,
+        bias_covariance: &Matrix6<f64>,
+        h: f64,
+    ) -> Option<Belief> {
+        let state = NavState {
+            world_from_body: Isometry3::identity(),
+            velocity: Vector3::zeros(),
+            ..*biases
+        };
+        let mut covariance = NavCovariance::zeros();
+        covariance
+            .fixed_view_mut::<6, 6>(block::GYRO_BIAS, block::GYRO_BIAS)
+            .copy_from(bias_covariance);
+        let mut motion = Belief { state, covariance };
+        let weightless = Self { gravity: Vector3::zeros(), ..self.clone() };
+        weightless.step(&mut motion, gyro, accel, h);
+        motion.is_finite().then_some(motion)
+    }
+
+    /// World coordinates, m/s^2; zero for the constant velocity model.
+    pub fn gravity(&self) -> &Vector3<f64> {
+        &self.gravity
+    }
+
     fn step(&self, belief: &mut Belief, gyro: &Vector3<f64>, accel: &Vector3<f64>, h: f64) {
         let state = &mut belief.state;
         let turn = (gyro - state.gyro_bias) * h;
@@ -189,7 +221,7 @@ pub(crate) fn symmetrize<const N: usize>(matrix: &mut SMatrix<f64, N, N>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::inertial::{NavState, Stamp};
+    use crate::inertial::Stamp;
     use nalgebra::SVector;
     use proptest::prelude::*;
 

@@ -10,7 +10,7 @@ use super::report::{
 use super::truth::TruthTrack;
 use super::{OdometryConfig, TruthPose};
 use crate::alignment::PointPair;
-use crate::filter::{FilterKind, MapTreatment, VisualInertialFilter, point_by_pose};
+use crate::filter::{FilterKind, MapTreatment, UpdateOutcome, VisualInertialFilter, point_by_pose};
 use crate::inertial::{Belief, ImuSample, Propagator, Stamp};
 use crate::map::{Map, MapPoint, ReferenceView, Sighting};
 use crate::vision::{
@@ -275,11 +275,11 @@ impl Odometry {
         times.ransac = clock.lap();
 
         let treatment = self.kind.map_treatment();
-        let innovation = running.update(&matches, &inliers, treatment, &view);
-        if innovation.is_none() && running.expects_matches {
+        let updated = running.update(&matches, &inliers, treatment, &view);
+        if updated.is_none() && running.expects_matches {
             self.stats.frames_without_update += 1;
         }
-        notes.extend(running.note_tracking(innovation.is_some(), stamp));
+        notes.extend(running.note_tracking(updated.is_some(), stamp));
         times.update = clock.lap();
 
         let fates = running.grow_map(number, features, &matches, &inliers, treatment, &view);
@@ -296,7 +296,8 @@ impl Odometry {
             covariance: belief.covariance,
             world_from_camera: belief.state.world_from_body * self.body_from_camera,
             matrix_fisher: running.filter.matrix_fisher(),
-            innovation,
+            innovation: updated.map(|outcome| outcome.innovation),
+            screening: updated.map(|outcome| outcome.screening),
             counts: StepCounts {
                 features: front.features.len(),
                 with_depth: features.iter().filter(|f| f.depth.is_some()).count(),
@@ -489,14 +490,14 @@ impl Running {
             .unwrap_or_default()
     }
 
-    /// Conditions belief and map on the inliers; the normalised innovation if there were any.
+    /// Conditions belief and map on the inliers; `None` if there were none.
     fn update(
         &mut self,
         matches: &[Association],
         inliers: &[usize],
         treatment: MapTreatment,
         view: &View,
-    ) -> Option<f64> {
+    ) -> Option<UpdateOutcome> {
         let pairs: Vec<_> = inliers
             .iter()
             .filter_map(|&i| matches.get(i))
@@ -505,13 +506,14 @@ impl Running {
         let only_pairs: Vec<_> = pairs.iter().map(|(_, pair)| *pair).collect();
         let outcome = self.filter.update(&only_pairs)?;
         if treatment == MapTreatment::Uncertain {
-            for (id, pair) in &pairs {
+            let entered = pairs.iter().zip(self.filter.passed()).filter(|(_, passed)| **passed);
+            for ((id, pair), _) in entered {
                 if let Some(refined) = self.filter.refine(pair) {
                     self.map.relocate(*id, refined.position, refined.covariance);
                 }
             }
         }
-        Some(outcome.innovation)
+        Some(outcome)
     }
 
     /// Renews the points seen, inserts new ones, forgets old ones. What became of each feature

@@ -3,6 +3,7 @@
 use nalgebra::{Isometry3, Matrix3};
 use serde::Serialize;
 
+use crate::filter::Screening;
 use crate::inertial::Stamp;
 use crate::inertial::{NavCovariance, NavState};
 use crate::so3::ProperSvd;
@@ -113,6 +114,8 @@ pub struct StepReport {
     pub matrix_fisher: Option<ProperSvd>,
     /// Mean squared normalised innovation per degree of freedom; about 1 when consistent.
     pub innovation: Option<f64>,
+    /// What the gate found of the inliers.
+    pub screening: Option<Screening>,
     pub counts: StepCounts,
     pub times: StageTimes,
     pub keypoints: Vec<KeypointView>,

@@ -90,11 +90,12 @@ const POSE: [usize; 6] = [
 /// Names of the columns of `state.csv`, in order; see `docs` of the command for their meaning.
 pub fn state_columns() -> Vec<String> {
     let mut columns = belief_columns();
-    columns.push("innovation".to_owned());
+    columns.extend(["innovation", "innovation_largest", "innovation_gate"].map(str::to_owned));
     columns.extend(
         ["features", "with_depth", "candidates", "matches", "inliers", "new_points", "map_points"]
             .map(str::to_owned),
     );
+    columns.push("rejected".to_owned());
     let stages = crate::odometry::StageTimes::default().stages();
     columns.extend(stages.map(|(stage, _)| format!("time_{stage}")));
     columns
@@ -122,11 +123,16 @@ pub(super) fn belief_columns() -> Vec<String> {
 fn state_line(report: &StepReport) -> String {
     let s = report.matrix_fisher.map(|svd| svd.s);
     let mut fields = belief_fields(report.stamp, &report.state, &report.covariance, s);
-    fields.push(optional_field(report.innovation));
+    let largest = report.screening.map(|screening| screening.largest);
+    // Empty where nothing limits the distance.
+    let gate = report.screening.map(|screening| screening.threshold).filter(|t| t.is_finite());
+    fields.extend([report.innovation, largest, gate].map(optional_field));
     let c = &report.counts;
     let counts =
         [c.features, c.with_depth, c.candidates, c.matches, c.inliers, c.new_points, c.map_points];
     fields.extend(counts.map(|count| count.to_string()));
+    let rejected = report.screening.map(|screening| screening.rejected);
+    fields.push(rejected.map(|count| count.to_string()).unwrap_or_default());
     fields.extend(report.times.stages().map(|(_, seconds)| format!("{seconds:.6}")));
     fields.join(",")
 }

@@ -97,6 +97,7 @@ impl Walk {
                 v: Rotation3::identity(),
             }),
             innovation: Some(self.rng.random_range(0.7..1.3)),
+            screening: None,
             counts: StepCounts {
                 features: keypoints.len(),
                 with_depth: keypoints.len() - count(KeypointRole::NoDepth),

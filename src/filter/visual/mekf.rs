@@ -2,7 +2,10 @@
 
 use nalgebra::{Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
 
-use super::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
+use super::gate::Gate;
+use super::{
+    FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation, world_point,
+};
 use crate::alignment::{PointPair, PoseInformation};
 use crate::inertial::{Belief, ImuSample, Propagator, block, symmetrize};
 use crate::so3::ProperSvd;
@@ -13,11 +16,12 @@ pub struct Mekf {
     config: FilterConfig,
     propagator: Propagator,
     belief: Belief,
+    gate: Gate,
 }
 
 impl Mekf {
     pub fn new(config: &FilterConfig, propagator: Propagator, belief: Belief) -> Self {
-        Self { config: config.clone(), propagator, belief }
+        Self { config: config.clone(), propagator, belief, gate: Gate::new(config) }
     }
 
     fn corrected(&self, information: &PoseInformation) -> Option<Belief> {
@@ -66,6 +70,10 @@ impl VisualInertialFilter for Mekf {
         let pose = &self.belief.state.world_from_body;
         let rotation = pose.rotation.to_rotation_matrix();
         let kernel = self.config.kernel();
+        let belief = &self.belief;
+        let screening =
+            self.gate.screen(pairs, &rotation, |pair| world_point(belief, &pair.in_body));
+        let pairs = self.gate.accepted();
         let information =
             PoseInformation::accumulate(pairs, &rotation, &pose.translation.vector, kernel);
         if information.points == 0 {
@@ -73,7 +81,11 @@ impl VisualInertialFilter for Mekf {
         }
         let innovation = normalized_innovation(&information, &self.belief)?;
         self.belief = self.corrected(&information).filter(Belief::is_finite)?;
-        Some(UpdateOutcome { innovation, points: information.points })
+        Some(UpdateOutcome { innovation, points: information.points, screening })
+    }
+
+    fn passed(&self) -> &[bool] {
+        self.gate.passed()
     }
 
     fn matrix_fisher(&self) -> Option<ProperSvd> {

@@ -1,41 +1,141 @@
 //! The matrix Fisher-Gaussian filter.
 
-use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 
-use super::{FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation};
-use crate::alignment::{PointPair, PoseInformation, rotated_vector_by_rotation, vectorize};
-use crate::inertial::{Belief, ImuSample, NavCovariance, NavState, Propagator, block, symmetrize};
+use super::broad::{
+    BroadBelief, EUCLIDEAN, NavRegression, POSITION, assemble, nav_state, of_belief,
+};
+use super::gate::Gate;
+use super::{
+    FilterConfig, UpdateMethod, UpdateOutcome, VisualInertialFilter, normalized_innovation,
+    world_point,
+};
+use crate::alignment::{
+    MapEstimate, PointPair, PoseInformation, rotated_vector_by_rotation, vectorize,
+};
+use crate::distribution::matrix_fisher::MatrixFisher;
+use crate::inertial::{Belief, ImuSample, Propagator, block};
 use crate::so3::ProperSvd;
 
-/// Euclidean part of the state: (velocity, position, gyro bias, accelerometer bias).
-const EUCLIDEAN: usize = 12;
-/// First of the Euclidean components in a belief's covariance.
-const FIRST: usize = block::VELOCITY;
-/// First component of the position within the Euclidean part.
-const POSITION: usize = block::POSITION - FIRST;
-/// Newton steps from the predicted attitude to the mode; it converges quadratically in 2 to 4.
-const MAX_NEWTON_STEPS: usize = 20;
-/// A Newton step below this ends the search, rad.
-const NEWTON_TOLERANCE: f64 = 1e-10;
+/// Least information about a rotation axis from which on the attitude is carried by its mode and
+/// covariance, 1/rad^2.
+const CONCENTRATED: f64 = 25.0;
+/// Sum of the variances of a rotation above which it is carried as a matrix Fisher distribution,
+/// rad^2; beyond the reach of [`CONCENTRATED`], so that beliefs do not go back and forth.
+const BROAD: f64 = 0.2;
+/// An attitude that moves less than this in an update needs no new weights, rad.
+const SETTLED: f64 = 1e-3;
 
-/// Filter whose belief is an MFG distribution (W22 chapter 3, body-frame variant MFGB).
+/// Filter whose belief is an MFG distribution (W22 chapter 3).
 ///
-/// Between updates the belief is carried in the concentrated form of W22 Theorem 3.4. An update
-/// is made with the densities themselves: matrix Fisher prior, Euclidean part regressed on the
-/// rotation matrix, and a likelihood that is quadratic in both (`PoseInformation`). The
-/// Euclidean part is integrated out exactly; the marginal `log p(R)` is brought to its mode by
-/// Newton's method on SO(3) and matched there by a matrix Fisher density with the same mode and
-/// curvature, `F = M (tr(H)/2 I - H)`.
+/// A concentrated belief is carried by its mode and covariance (W22 theorem 3.4), a broad one as
+/// a matrix Fisher distribution and a regression on the whole rotation matrix. An update is made
+/// with the densities themselves: matrix Fisher prior, Euclidean part regressed on `R`, and a
+/// likelihood that is quadratic in both (`PoseInformation`). The Euclidean part is integrated out
+/// exactly. If the marginal `log p(R)` is concentrated it is matched by a matrix Fisher density
+/// with the same mode and curvature, `F = M (tr(H)/2 I - H)`; otherwise by the one with the same
+/// mean `E[R]`.
 #[derive(Debug, Clone)]
 pub struct MfgFilter {
     config: FilterConfig,
     propagator: Propagator,
+    /// The belief, or its summary while it is broad.
     belief: Belief,
+    broad: Option<Box<BroadBelief>>,
+    gate: Gate,
 }
 
 impl MfgFilter {
     pub fn new(config: &FilterConfig, propagator: Propagator, belief: Belief) -> Self {
-        Self { config: config.clone(), propagator, belief }
+        let gate = Gate::new(config);
+        let mut filter = Self { config: config.clone(), propagator, belief, broad: None, gate };
+        filter.broaden();
+        filter
+    }
+
+    /// Starts from a broad attitude that is independent of the rest of `belief`.
+    pub fn broad(
+        config: &FilterConfig,
+        propagator: Propagator,
+        belief: Belief,
+        attitude: &MatrixFisher,
+    ) -> Self {
+        let broad = BroadBelief::independent(&belief, attitude);
+        let belief = broad.summary();
+        let gate = Gate::new(config);
+        Self { config: config.clone(), propagator, belief, broad: Some(Box::new(broad)), gate }
+    }
+
+    /// Changes the form of a belief that has become too uncertain for a covariance.
+    fn broaden(&mut self) {
+        let rotation = self.belief.covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION);
+        if rotation.trace() > BROAD {
+            self.broad = BroadBelief::of_belief(&self.belief).map(Box::new);
+        }
+    }
+
+    fn propagate_broad(&mut self, gyro: &Vector3<f64>, accel: &Vector3<f64>, h: f64) -> bool {
+        let Some(broad) = &mut self.broad else { return false };
+        let moved = broad.propagate(&self.propagator, gyro, accel, h).is_some();
+        if moved {
+            self.belief = broad.summary();
+        }
+        moved
+    }
+
+    fn update_broad(&mut self, broad: &BroadBelief) -> Option<usize> {
+        let pairs = self.gate.accepted();
+        let update = broad.update(pairs, self.config.kernel(), self.config.relinearizations)?;
+        let points = update.points;
+        if update.least_information > CONCENTRATED {
+            let belief = concentrate(&update.density, &update.mode, &Vector3::zeros())?;
+            self.belief = Some(belief).filter(Belief::is_finite)?;
+            self.broad = None;
+        } else {
+            let broad = update.into_belief()?;
+            self.belief = Some(broad.summary()).filter(Belief::is_finite)?;
+            self.broad = Some(Box::new(broad));
+        }
+        Some(points)
+    }
+
+    fn update_by_sigma_points(&mut self, information: &PoseInformation) -> Option<usize> {
+        let prior = match self.broad.as_deref() {
+            Some(broad) => broad.clone(),
+            None => BroadBelief::of_belief(&self.belief)?,
+        };
+        let posterior = prior.update_by_sigma_points(information)?;
+        self.belief = Some(posterior.summary()).filter(Belief::is_finite)?;
+        self.broad = (posterior.least_information() <= CONCENTRATED).then(|| Box::new(posterior));
+        Some(information.points)
+    }
+
+    /// `information` is that of the accepted points at the predicted pose.
+    fn update_concentrated(&mut self, mut information: PoseInformation) -> Option<usize> {
+        let mut rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
+        let mut renewals = self.config.relinearizations;
+        let posterior = loop {
+            let origin = information.origin;
+            let prior = of_belief(&self.belief, &origin)?;
+            let joint = prior.conditioned(POSITION, &information.joint)?;
+            let posterior = concentrate(&joint, &rotation, &origin)?;
+            let pose = &posterior.state.world_from_body;
+            let found = pose.rotation.to_rotation_matrix();
+            if renewals == 0 || found.angle_to(&rotation) < SETTLED {
+                break posterior;
+            }
+            renewals -= 1;
+            rotation = found;
+            information = self.accumulate(&rotation, &pose.translation.vector);
+        };
+        self.belief = Some(posterior).filter(Belief::is_finite)?;
+        Some(information.points)
+    }
+
+    /// What the accepted points say of the pose, weighted as at the given one.
+    fn accumulate(&self, rotation: &Rotation3<f64>, position: &Vector3<f64>) -> PoseInformation {
+        let kernel = self.config.kernel();
+        PoseInformation::accumulate(self.gate.accepted(), rotation, position, kernel)
     }
 }
 
@@ -45,214 +145,98 @@ impl VisualInertialFilter for MfgFilter {
     }
 
     fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool {
-        self.propagator.propagate(&mut self.belief, from, to)
+        if self.broad.is_some() {
+            let h = to.stamp.seconds_since(from.stamp);
+            let gyro = (from.angular_velocity + to.angular_velocity) * 0.5;
+            let accel = (from.specific_force + to.specific_force) * 0.5;
+            return h <= 0.0 || self.propagate_broad(&gyro, &accel, h);
+        }
+        let moved = self.propagator.propagate(&mut self.belief, from, to);
+        self.broaden();
+        moved
     }
 
     fn coast(&mut self, seconds: f64) {
+        if self.broad.is_some() {
+            if seconds > 0.0 {
+                self.propagate_broad(&Vector3::zeros(), &Vector3::zeros(), seconds);
+            }
+            return;
+        }
         self.propagator.coast(&mut self.belief, seconds);
+        self.broaden();
     }
 
     fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome> {
-        let kernel = self.config.kernel();
-        let pose = self.belief.state.world_from_body;
-        let (mut rotation, mut position) =
-            (pose.rotation.to_rotation_matrix(), pose.translation.vector);
-        let mut innovation = None;
-        let mut posterior = None;
-        let mut points = 0;
-        for _ in 0..=self.config.relinearizations {
-            let information = PoseInformation::accumulate(pairs, &rotation, &position, kernel);
-            if information.points == 0 {
-                return None;
-            }
-            if innovation.is_none() {
-                innovation = Some(normalized_innovation(&information, &self.belief)?);
-            }
-            points = information.points;
-            let joint = Joint::of_prior(&self.belief, &position)?.conditioned(&information)?;
-            let belief = joint.concentrate(&rotation)?;
-            rotation = belief.state.world_from_body.rotation.to_rotation_matrix();
-            position = belief.state.world_from_body.translation.vector;
-            posterior = Some(belief);
+        let pose = &self.belief.state.world_from_body;
+        let rotation = pose.rotation.to_rotation_matrix();
+        let (belief, broad) = (&self.belief, self.broad.as_deref());
+        let screening = self.gate.screen(pairs, &rotation, |pair| match broad {
+            Some(broad) => broad.world_point(&pair.in_body),
+            None => world_point(belief, &pair.in_body),
+        });
+        let information = self.accumulate(&rotation, &pose.translation.vector);
+        if information.points == 0 {
+            return None;
         }
-        self.belief = posterior.filter(Belief::is_finite)?;
-        Some(UpdateOutcome { innovation: innovation?, points })
+        let innovation = normalized_innovation(&information, &self.belief)?;
+        let points = match (self.config.update_method, self.broad.clone()) {
+            (UpdateMethod::SigmaPoints, _) => self.update_by_sigma_points(&information)?,
+            (UpdateMethod::Exact, Some(broad)) => self.update_broad(&broad)?,
+            (UpdateMethod::Exact, None) => self.update_concentrated(information)?,
+        };
+        Some(UpdateOutcome { innovation, points, screening })
+    }
+
+    fn passed(&self) -> &[bool] {
+        self.gate.passed()
     }
 
     fn matrix_fisher(&self) -> Option<ProperSvd> {
-        self.belief.attitude().map(|attitude| *attitude.svd())
-    }
-}
-
-/// Density of `r = vec(R)` and the Euclidean part `x`, with the position relative to `origin`:
-/// `log p(R) = linear^T r - r^T quadratic r / 2 + const`, `x | R ~ N(offset + slope r, covariance)`.
-///
-/// Matrix Fisher-Gaussian densities have this form with `quadratic = 0`; point likelihoods keep
-/// it.
-struct Joint {
-    origin: Vector3<f64>,
-    linear: SVector<f64, 9>,
-    quadratic: SMatrix<f64, 9, 9>,
-    offset: SVector<f64, EUCLIDEAN>,
-    slope: SMatrix<f64, EUCLIDEAN, 9>,
-    covariance: SMatrix<f64, EUCLIDEAN, EUCLIDEAN>,
-}
-
-impl Joint {
-    /// The MFG with the mode and covariance of `belief` (W22 Theorem 3.4, backwards).
-    fn of_prior(belief: &Belief, origin: &Vector3<f64>) -> Option<Self> {
-        let state = &belief.state;
-        let mode = state.world_from_body.rotation.to_rotation_matrix();
-        let rotation_covariance =
-            belief.covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION).into_owned();
-        let cross =
-            belief.covariance.fixed_view::<EUCLIDEAN, 3>(FIRST, block::ROTATION).into_owned();
-        let information = rotation_covariance.cholesky()?.inverse();
-        let concentration = Matrix3::identity() * (0.5 * information.trace()) - information;
-
-        let mut offset = SVector::<f64, EUCLIDEAN>::zeros();
-        offset.fixed_rows_mut::<3>(0).copy_from(&state.velocity);
-        let position = state.world_from_body.translation.vector - origin;
-        offset.fixed_rows_mut::<3>(POSITION).copy_from(&position);
-        offset.fixed_rows_mut::<3>(block::GYRO_BIAS - FIRST).copy_from(&state.gyro_bias);
-        offset.fixed_rows_mut::<3>(block::ACCEL_BIAS - FIRST).copy_from(&state.accel_bias);
-        Some(Self {
-            origin: *origin,
-            linear: vectorize(&(mode.matrix() * concentration)),
-            quadratic: SMatrix::zeros(),
-            offset,
-            slope: cross * tangent_coordinate(mode.matrix(), &concentration),
-            covariance: belief
-                .covariance
-                .fixed_view::<EUCLIDEAN, EUCLIDEAN>(FIRST, FIRST)
-                .into_owned()
-                - cross * information * cross.transpose(),
-        })
-    }
-
-    /// Bayes' rule with a point likelihood about the same origin. Exact.
-    fn conditioned(mut self, points: &PoseInformation) -> Option<Self> {
-        debug_assert_eq!(self.origin, points.origin);
-        // Given R, the points measure the position as `measured + by_rotation r` with covariance
-        // `spread`.
-        let spread = points.tt.cholesky()?.inverse();
-        let measured = spread * points.eta_t;
-        let by_rotation = -(spread * points.rt.transpose());
-
-        let position_columns = self.covariance.fixed_columns::<3>(POSITION).into_owned();
-        let position_covariance = self.covariance.fixed_view::<3, 3>(POSITION, POSITION);
-        let weight = (position_covariance + spread).cholesky()?.inverse();
-        let gain = position_columns * weight;
-        let surprise = measured - self.offset.fixed_rows::<3>(POSITION);
-        let surprise_slope = by_rotation - self.slope.fixed_rows::<3>(POSITION);
-
-        // What the position could not explain is evidence about R, and so is the part of the
-        // point likelihood that does not depend on the position.
-        self.quadratic += points.rr
-            + points.rt * by_rotation
-            + surprise_slope.transpose() * weight * surprise_slope;
-        self.linear +=
-            points.eta_r - points.rt * measured - surprise_slope.transpose() * (weight * surprise);
-        self.offset += gain * surprise;
-        self.slope += gain * surprise_slope;
-        self.covariance -= gain * position_columns.transpose();
-        symmetrize(&mut self.covariance);
-        Some(self)
-    }
-
-    /// Mode of `log p(R)` and minus its Hessian there, in body-frame rotation coordinates.
-    fn mode(&self, start: &Rotation3<f64>) -> Option<(Rotation3<f64>, Matrix3<f64>)> {
-        let mut mode = *start;
-        for _ in 0..MAX_NEWTON_STEPS {
-            let (gradient, information) = self.derivatives(&mode);
-            // Away from the mode the exact Hessian may be indefinite; the Gauss-Newton part of
-            // it never is.
-            let step = match information.cholesky() {
-                Some(cholesky) => cholesky.solve(&gradient),
-                None => self.curvature(&mode).cholesky()?.solve(&gradient),
-            };
-            mode *= Rotation3::new(step);
-            if step.norm() < NEWTON_TOLERANCE {
-                break;
-            }
-        }
-        mode.renormalize();
-        let (_, information) = self.derivatives(&mode);
-        information.iter().all(|x| x.is_finite()).then_some((mode, information))
-    }
-
-    /// Gradient of `log p(R exp(e^))` by `e`, and minus its Hessian.
-    fn derivatives(&self, at: &Rotation3<f64>) -> (Vector3<f64>, Matrix3<f64>) {
-        let d = rotated_vector_by_rotation(at.matrix());
-        let slope = self.linear - self.quadratic * vectorize(at.matrix());
-        let in_body = at.matrix().transpose() * Matrix3::from_column_slice(slope.as_slice());
-        let second = (in_body + in_body.transpose()) * 0.5 - Matrix3::identity() * in_body.trace();
-        (d.transpose() * slope, d.transpose() * self.quadratic * d - second)
-    }
-
-    fn curvature(&self, at: &Rotation3<f64>) -> Matrix3<f64> {
-        let d = rotated_vector_by_rotation(at.matrix());
-        d.transpose() * self.quadratic * d
-    }
-
-    /// The belief with this density's mode and moments, to second order in the rotation error.
-    fn concentrate(&self, start: &Rotation3<f64>) -> Option<Belief> {
-        let (mode, information) = self.mode(start)?;
-        let rotation_covariance = information.cholesky()?.inverse();
-        // E[R] = M (I + E[e^ e^] / 2).
-        let shrink =
-            (rotation_covariance - Matrix3::identity() * rotation_covariance.trace()) * 0.5;
-        let mean = mode.matrix() * (Matrix3::identity() + shrink);
-        let x = self.offset + self.slope * vectorize(&mean);
-        let by_rotation = self.slope * rotated_vector_by_rotation(mode.matrix());
-        let cross = by_rotation * rotation_covariance;
-
-        let mut covariance = NavCovariance::zeros();
-        covariance
-            .fixed_view_mut::<3, 3>(block::ROTATION, block::ROTATION)
-            .copy_from(&rotation_covariance);
-        covariance.fixed_view_mut::<EUCLIDEAN, 3>(FIRST, block::ROTATION).copy_from(&cross);
-        covariance
-            .fixed_view_mut::<3, EUCLIDEAN>(block::ROTATION, FIRST)
-            .copy_from(&cross.transpose());
-        covariance
-            .fixed_view_mut::<EUCLIDEAN, EUCLIDEAN>(FIRST, FIRST)
-            .copy_from(&(self.covariance + cross * by_rotation.transpose()));
-        symmetrize(&mut covariance);
-
-        let part = |start: usize| x.fixed_rows::<3>(start - FIRST).into_owned();
-        let position: Vector3<f64> = self.origin + part(block::POSITION);
-        let state = NavState {
-            world_from_body: nalgebra::Isometry3::from_parts(
-                position.into(),
-                UnitQuaternion::from_rotation_matrix(&mode),
-            ),
-            velocity: part(block::VELOCITY),
-            gyro_bias: part(block::GYRO_BIAS),
-            accel_bias: part(block::ACCEL_BIAS),
-        };
-        Some(Belief { state, covariance })
-    }
-}
-
-/// The 3x9 matrix `L` with `L vec(R) = (K M^T R - R^T M K)^vee`: the `v_R` of MFGB (W22 3.2) in
-/// body coordinates. It is zero at the mode `M` and grows there as `(tr(K) I - K) e`.
-fn tangent_coordinate(mode: &Matrix3<f64>, concentration: &Matrix3<f64>) -> SMatrix<f64, 3, 9> {
-    let left = concentration * mode.transpose();
-    let mut l = SMatrix::zeros();
-    for (component, (i, j)) in [(2, 1), (0, 2), (1, 0)].into_iter().enumerate() {
-        for k in 0..3 {
-            l[(component, 3 * j + k)] += left[(i, k)];
-            l[(component, 3 * i + k)] -= left[(j, k)];
+        match &self.broad {
+            Some(broad) => Some(*broad.attitude().svd()),
+            None => self.belief.attitude().map(|attitude| *attitude.svd()),
         }
     }
-    l
+
+    fn world_point(&self, in_body: &Vector3<f64>) -> MapEstimate {
+        match &self.broad {
+            Some(broad) => broad.world_point(in_body),
+            None => world_point(&self.belief, in_body),
+        }
+    }
+}
+
+/// The belief with the mode of a density, position relative to `origin`, and its moments to
+/// second order in the rotation error.
+fn concentrate(
+    density: &NavRegression,
+    start: &Rotation3<f64>,
+    origin: &Vector3<f64>,
+) -> Option<Belief> {
+    let (mode, information) = density.attitude.mode(start)?;
+    let rotation_covariance = information.cholesky()?.inverse();
+    // E[R] = M (I + E[e^ e^] / 2).
+    let shrink = (rotation_covariance - Matrix3::identity() * rotation_covariance.trace()) * 0.5;
+    let mean = mode.matrix() * (Matrix3::identity() + shrink);
+    let mut x = density.offset + density.slope * vectorize(&mean);
+    let mut position = x.fixed_rows_mut::<3>(POSITION);
+    position += origin;
+    let by_rotation = density.slope * rotated_vector_by_rotation(mode.matrix());
+    let cross = by_rotation * rotation_covariance;
+    let euclidean: nalgebra::SMatrix<f64, EUCLIDEAN, EUCLIDEAN> =
+        density.covariance + cross * by_rotation.transpose();
+    Some(Belief {
+        state: nav_state(&mode, &x),
+        covariance: assemble(&rotation_covariance, &cross, &euclidean),
+    })
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::broad::gradient_coordinate;
     use super::*;
-    use crate::alignment::RobustKernel;
+    use crate::inertial::{NavCovariance, NavState};
     use approx::assert_relative_eq;
     use nalgebra::Isometry3;
     use rand::{Rng, SeedableRng};
@@ -297,13 +281,6 @@ mod tests {
             .collect()
     }
 
-    fn log_density(joint: &Joint, r: &Rotation3<f64>, x: &SVector<f64, EUCLIDEAN>) -> f64 {
-        let v = vectorize(r.matrix());
-        let residual = x - joint.offset - joint.slope * v;
-        let euclidean = residual.dot(&joint.covariance.cholesky().unwrap().solve(&residual));
-        joint.linear.dot(&v) - 0.5 * v.dot(&(joint.quadratic * v)) - 0.5 * euclidean
-    }
-
     #[test]
     fn the_tangent_coordinate_is_v_r() {
         let mode = Rotation3::new(Vector3::new(0.3, -1.2, 0.7));
@@ -312,35 +289,9 @@ mod tests {
         let rotation = mode * turn;
         let skew = k * turn.matrix() - turn.matrix().transpose() * k;
         let expected = Vector3::new(skew[(2, 1)], skew[(0, 2)], skew[(1, 0)]);
-        let l = tangent_coordinate(mode.matrix(), &k);
+        let l = gradient_coordinate(&(mode.matrix() * k));
         assert_relative_eq!(l * vectorize(rotation.matrix()), expected, epsilon = 1e-12);
         assert_relative_eq!(l * vectorize(mode.matrix()), Vector3::zeros(), epsilon = 1e-12);
-    }
-
-    /// Bayes' rule holds at any attitude and state, however far from the mode.
-    #[test]
-    fn conditioning_is_exact() {
-        let mut rng = ChaCha8Rng::seed_from_u64(7);
-        for _ in 0..20 {
-            let prior = belief(&mut rng, 0.8);
-            let pairs = pairs(&mut rng, &prior.state, 0.3, 6);
-            let at = prior.state.world_from_body;
-            let (rotation, origin) = (at.rotation.to_rotation_matrix(), at.translation.vector);
-            let likelihood =
-                PoseInformation::accumulate(&pairs, &rotation, &origin, RobustKernel::None);
-            let before = Joint::of_prior(&prior, &origin).unwrap();
-            let after = Joint::of_prior(&prior, &origin).unwrap().conditioned(&likelihood).unwrap();
-            let mut constant = None;
-            for _ in 0..10 {
-                let r = Rotation3::new(random_vector(&mut rng, 2.0));
-                let x = SVector::<f64, EUCLIDEAN>::from_fn(|_, _| rng.random_range(-2.0..2.0));
-                let t = origin + x.fixed_rows::<3>(POSITION);
-                let bayes = log_density(&before, &r, &x) - 0.5 * likelihood.cost(&r, &t);
-                let difference = log_density(&after, &r, &x) - bayes;
-                let constant = *constant.get_or_insert(difference);
-                assert_relative_eq!(difference, constant, epsilon = 1e-6 * (1.0 + bayes.abs()));
-            }
-        }
     }
 
     #[test]
@@ -348,35 +299,11 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let prior = belief(&mut rng, 0.02);
         let at = prior.state.world_from_body;
-        let joint = Joint::of_prior(&prior, &at.translation.vector).unwrap();
-        let back = joint.concentrate(&at.rotation.to_rotation_matrix()).unwrap();
+        let origin = at.translation.vector;
+        let density = of_belief(&prior, &origin).unwrap();
+        let back = concentrate(&density, &at.rotation.to_rotation_matrix(), &origin).unwrap();
         assert_relative_eq!(back.covariance, prior.covariance, epsilon = 1e-4);
         assert_relative_eq!(back.state.velocity, prior.state.velocity, epsilon = 1e-3);
-    }
-
-    #[test]
-    fn derivatives_are_those_of_the_density() {
-        let mut rng = ChaCha8Rng::seed_from_u64(11);
-        let prior = belief(&mut rng, 0.5);
-        let pairs = pairs(&mut rng, &prior.state, 0.3, 5);
-        let at = prior.state.world_from_body;
-        let (rotation, origin) = (at.rotation.to_rotation_matrix(), at.translation.vector);
-        let likelihood =
-            PoseInformation::accumulate(&pairs, &rotation, &origin, RobustKernel::None);
-        let joint = Joint::of_prior(&prior, &origin).unwrap().conditioned(&likelihood).unwrap();
-        let value = |e: Vector3<f64>| {
-            let r = vectorize((rotation * Rotation3::new(e)).matrix());
-            joint.linear.dot(&r) - 0.5 * r.dot(&(joint.quadratic * r))
-        };
-        let (gradient, information) = joint.derivatives(&rotation);
-        let h = 1e-4;
-        for i in 0..3 {
-            let step = Vector3::ith(i, h);
-            let slope = (value(step) - value(-step)) / (2.0 * h);
-            assert_relative_eq!(slope, gradient[i], epsilon = 1e-4, max_relative = 1e-4);
-            let second = (value(step) + value(-step) - 2.0 * value(Vector3::zeros())) / (h * h);
-            assert_relative_eq!(-second, information[(i, i)], max_relative = 1e-3);
-        }
     }
 
     /// Where everything is small, the extended Kalman filter and this one are the same.
@@ -397,6 +324,42 @@ mod tests {
         assert!(apart < 1e-8, "{apart}");
         assert_relative_eq!(a.state.velocity, b.state.velocity, epsilon = 1e-6);
         assert_relative_eq!(a.covariance, b.covariance, epsilon = 1e-9);
+    }
+
+    /// Where measurements do not correlate rotations about the principal axes.
+    #[test]
+    fn sigma_points_come_close_to_the_exact_update() {
+        let state = NavState {
+            world_from_body: Isometry3::identity(),
+            velocity: Vector3::zeros(),
+            gyro_bias: Vector3::zeros(),
+            accel_bias: Vector3::zeros(),
+        };
+        let prior = Belief { state, covariance: NavCovariance::identity() * 0.02 };
+        let turn = Rotation3::new(Vector3::new(0.08, -0.05, 0.1));
+        let pair = |in_body: Vector3<f64>| PointPair {
+            in_body,
+            body_covariance: Matrix3::identity() * 0.1,
+            in_world: turn * in_body,
+            world_covariance: Matrix3::zeros(),
+        };
+        let axes = [Vector3::x(), Vector3::y(), Vector3::z()];
+        let pairs: Vec<_> = axes.iter().flat_map(|axis| [pair(*axis), pair(-axis)]).collect();
+        let update = |update_method| {
+            let config = FilterConfig { huber: 0.0, update_method, ..FilterConfig::default() };
+            let propagator = Propagator::constant_velocity(1.0, 1.0);
+            let mut filter = MfgFilter::new(&config, propagator, prior);
+            filter.update(&pairs).unwrap();
+            *filter.belief()
+        };
+        let (exact, points) = (update(UpdateMethod::Exact), update(UpdateMethod::SigmaPoints));
+        let rotation = |belief: &Belief| belief.state.world_from_body.rotation;
+        let moved = rotation(&exact).angle_to(&rotation(&prior));
+        let apart = rotation(&points).angle_to(&rotation(&exact));
+        assert!(moved > 0.03 && apart < 0.15 * moved, "{apart} of {moved}");
+        let spread = |belief: &Belief| belief.covariance.fixed_view::<3, 3>(0, 0).trace();
+        let ratio = spread(&points) / spread(&exact);
+        assert!((ratio - 1.0).abs() < 0.15, "{ratio}");
     }
 
     #[test]

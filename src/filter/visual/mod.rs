@@ -1,5 +1,7 @@
 //! What all visual-inertial filters share: the trait, the map treatment, the point posteriors.
 
+mod broad;
+mod gate;
 mod mekf;
 mod mfg;
 
@@ -9,8 +11,9 @@ use std::str::FromStr;
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::alignment::{PointPair, PoseInformation, RobustKernel};
-use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block, symmetrize};
+use crate::alignment::{MapEstimate, PointPair, PoseInformation, RobustKernel};
+use crate::distribution::matrix_fisher::MatrixFisher;
+use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block};
 use crate::so3::ProperSvd;
 
 pub use mekf::Mekf;
@@ -68,6 +71,23 @@ impl FilterKind {
             Self::Mekfd | Self::Mekfr => Box::new(Mekf::new(config, propagator, belief)),
         }
     }
+
+    /// The same where the attitude is too uncertain for a covariance: the MFG filters start from
+    /// `attitude`, independent of the rest of `belief`; the Gaussian ones from `belief` alone.
+    pub fn start_broad(
+        self,
+        config: &FilterConfig,
+        propagator: Propagator,
+        belief: Belief,
+        attitude: &MatrixFisher,
+    ) -> Box<dyn VisualInertialFilter> {
+        match self {
+            Self::Mfgd | Self::Mfgr => {
+                Box::new(MfgFilter::broad(config, propagator, belief, attitude))
+            }
+            Self::Mekfd | Self::Mekfr => self.start(config, propagator, belief),
+        }
+    }
 }
 
 impl fmt::Display for FilterKind {
@@ -87,12 +107,28 @@ impl FromStr for FilterKind {
     }
 }
 
+/// How an MFG filter finds the matrix Fisher distribution of the attitude after an update.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum UpdateMethod {
+    /// By mode and curvature of the exact marginal density where it is concentrated, by its mean
+    /// elsewhere.
+    Exact,
+    /// By reweighting seven sigma points progressively (W22 tables 5.8, 5.13).
+    SigmaPoints,
+}
+
 /// Settings of the measurement update and of the initial uncertainty.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FilterConfig {
     /// Mahalanobis distance beyond which the weight of a point falls (Huber); 0: never.
     pub huber: f64,
+    /// Probability with which a point that fits the model passes the gate on its squared
+    /// Mahalanobis distance (chi-square, 3 degrees of freedom); 0: no gate.
+    pub gate_probability: f64,
+    /// How the MFG filters match the attitude after an update.
+    pub update_method: UpdateMethod,
     /// Times the attitude is re-linearised within one update of the MFG filters.
     pub relinearizations: usize,
     /// Factor on the covariance of every point measurement, for what the sensor model leaves out
@@ -122,6 +158,8 @@ impl Default for FilterConfig {
     fn default() -> Self {
         Self {
             huber: 2.0,
+            gate_probability: 0.9999,
+            update_method: UpdateMethod::Exact,
             relinearizations: 2,
             measurement_inflation: 1.0,
             velocity_sd: 0.1,
@@ -150,17 +188,24 @@ impl FilterConfig {
 /// What an update did, besides changing the belief.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UpdateOutcome {
-    /// Squared normalised innovation per degree of freedom; about 1 when consistent.
+    /// Squared normalised innovation per degree of freedom of the points that entered; about 1
+    /// when consistent.
     pub innovation: f64,
     /// Pairs that entered.
     pub points: usize,
+    pub screening: Screening,
 }
 
-/// Position of a map point and its covariance, world coordinates (m, m^2).
+/// What the gate found of the points before an update.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct MapEstimate {
-    pub position: Vector3<f64>,
-    pub covariance: Matrix3<f64>,
+pub struct Screening {
+    /// Largest squared Mahalanobis distance of a point from its prediction.
+    pub largest: f64,
+    /// The distance beyond which points are left out; infinite without a gate, or when it had to
+    /// be opened because most points failed it.
+    pub threshold: f64,
+    /// Points left out.
+    pub rejected: usize,
 }
 
 /// A recursive estimator of attitude, velocity, position and IMU biases that is corrected by
@@ -180,11 +225,20 @@ pub trait VisualInertialFilter: Send {
     /// finite belief follows from them.
     fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome>;
 
+    /// For each pair offered to the last update whether it passed the gate.
+    fn passed(&self) -> &[bool];
+
     /// Parameter of the attitude's matrix Fisher part, if the filter has one.
     fn matrix_fisher(&self) -> Option<ProperSvd>;
+
+    /// Mean and covariance of the world position of a point that is fixed in the body, W22
+    /// (5.84), (5.85).
+    fn world_point(&self, in_body: &Vector3<f64>) -> MapEstimate {
+        world_point(self.belief(), in_body)
+    }
 }
 
-impl dyn VisualInertialFilter {
+impl dyn VisualInertialFilter + '_ {
     /// Covariance of (rotation, position), the blocks that a point measurement sees.
     pub fn pose_covariance(&self) -> Matrix6<f64> {
         pose_covariance(&self.belief().covariance)
@@ -199,35 +253,36 @@ impl dyn VisualInertialFilter {
         in_body: &Vector3<f64>,
         body_covariance: &Matrix3<f64>,
     ) -> MapEstimate {
-        let pose = self.belief().state.world_from_body;
-        let rotation = pose.rotation.to_rotation_matrix();
+        let rotation = self.belief().state.world_from_body.rotation.to_rotation_matrix();
         let measured = rotation.matrix() * body_covariance * rotation.matrix().transpose();
+        let seen = self.world_point(in_body);
         let covariance = match treatment {
             MapTreatment::Fixed => measured,
-            MapTreatment::Uncertain => {
-                let j = point_by_pose(rotation.matrix(), in_body);
-                measured + j * self.pose_covariance() * j.transpose()
-            }
+            MapTreatment::Uncertain => measured + seen.covariance,
         };
-        MapEstimate { position: rotation * in_body + pose.translation.vector, covariance }
+        MapEstimate { position: seen.position, covariance }
     }
 
-    /// Posterior of the map point of `pair` given the updated pose, by `K = B (A + B)^-1`:
-    /// `E[p] = (I - K) p + K (R p' + t)`, `Cov[p] = (I - K) B + K J C J^T K^T`, the short form
-    /// of W22 Theorem 5.8 and (G.6)-(G.8). `None` if `A + B` is singular.
+    /// Posterior of the map point of `pair` given the updated pose; `None` if the pair has no
+    /// positive definite covariance.
     pub fn refine(&self, pair: &PointPair) -> Option<MapEstimate> {
-        let pose = self.belief().state.world_from_body;
-        let rotation = pose.rotation.to_rotation_matrix();
-        let measured = rotation.matrix() * pair.body_covariance * rotation.matrix().transpose();
-        let weight = (measured + pair.world_covariance).cholesky()?.inverse();
-        let gain = pair.world_covariance * weight;
-        let seen = rotation * pair.in_body + pose.translation.vector;
-        let j = gain * point_by_pose(rotation.matrix(), &pair.in_body);
-        let mut covariance = (Matrix3::identity() - gain) * pair.world_covariance
-            + j * self.pose_covariance() * j.transpose();
-        symmetrize(&mut covariance);
-        Some(MapEstimate { position: pair.in_world + gain * (seen - pair.in_world), covariance })
+        let rotation = self.belief().state.world_from_body.rotation.to_rotation_matrix();
+        MapEstimate::posterior(pair, &rotation, &self.world_point(&pair.in_body))
     }
+}
+
+/// Mean and covariance of `R p' + t` to first order in the rotation error.
+fn world_point(belief: &Belief, in_body: &Vector3<f64>) -> MapEstimate {
+    let pose = &belief.state.world_from_body;
+    let rotation = pose.rotation.to_rotation_matrix();
+    let part = |row: usize, column: usize| belief.covariance.fixed_view::<3, 3>(row, column);
+    let lever = -(rotation.matrix() * in_body.cross_matrix());
+    let cross = lever * part(block::ROTATION, block::POSITION);
+    let covariance = lever * part(block::ROTATION, block::ROTATION) * lever.transpose()
+        + cross
+        + cross.transpose()
+        + part(block::POSITION, block::POSITION);
+    MapEstimate { position: rotation * in_body + pose.translation.vector, covariance }
 }
 
 /// Derivative of `R p' + t` by (body-frame rotation error, position), 3x6.
