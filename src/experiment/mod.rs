@@ -3,10 +3,12 @@
 //! A [`Study`] is an entry of [`studies`]; it draws its runs with [`monte_carlo`] and sums them up
 //! in a [`Report`], where each figure stands beside the paper's.
 
+mod alignment;
 mod attitude;
 mod gnss;
 pub mod matrix_fisher;
 mod study;
+mod visual;
 
 pub use matrix_fisher::{Curve, Figure};
 pub use study::{
@@ -15,7 +17,7 @@ pub use study::{
 
 /// Every study, in the order of `experiment --list`.
 pub fn studies() -> impl Iterator<Item = &'static Study> {
-    let studies = [matrix_fisher::STUDIES, gnss::STUDIES];
+    let studies = [matrix_fisher::STUDIES, gnss::STUDIES, alignment::STUDIES, visual::STUDIES];
     studies.into_iter().chain(attitude::STUDIES).flatten()
 }
 

@@ -2,6 +2,7 @@
 
 mod config;
 mod inertial;
+mod landmarks;
 mod motion;
 mod render;
 mod sensors;
@@ -12,6 +13,7 @@ mod world;
 
 pub use config::{ImuSensorConfig, LightConfig, SceneConfig, SceneError, TruthConfig};
 pub use inertial::ImuSimulator;
+pub use landmarks::{LandmarkFrame, LandmarkScene, LandmarkSceneConfig, LandmarkSighting};
 pub use motion::{BodyState, Motion, MotionConfig, MotionKind};
 pub use render::{DropoutConfig, ImageConfig, Renderer, Shot};
 pub use sensors::Simulation;
