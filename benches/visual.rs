@@ -1,0 +1,122 @@
+//! Costs of a visual-inertial step, with a 3x3 singular value decomposition and a weighted Kabsch
+//! fit in the same run as the units: `cargo bench --bench visual --no-default-features`.
+
+use std::hint::black_box;
+
+use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+use mfg_vio::alignment::{PointPair, WeightedPair, align, weighted_kabsch};
+use mfg_vio::filter::{FilterConfig, FilterKind};
+use mfg_vio::inertial::{Belief, ImuConfig, ImuSample, NavCovariance, NavState, Propagator, Stamp};
+use mfg_vio::so3::exp;
+use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
+
+const POINTS: [usize; 3] = [125, 500, 2000];
+
+fn world_from_body() -> Isometry3<f64> {
+    Isometry3::new(Vector3::new(1.0, -2.0, 0.5), Vector3::new(0.3, -0.4, 1.2))
+}
+
+/// Points of an RGB-D camera: depth noise grows with the square of the depth.
+fn pairs(count: usize) -> Vec<PointPair> {
+    let pose = world_from_body();
+    let pair = |i: usize| {
+        let phase = i as f64;
+        let z = 1.5 + (0.7 * phase).sin();
+        let in_body = Vector3::new(0.4 * z * (1.3 * phase).sin(), 0.3 * z * phase.cos(), z);
+        let noise = Vector3::new((3.0 * phase).sin(), (5.0 * phase).cos(), (7.0 * phase).sin());
+        let depth_variance = (2.5e-3 * z * z).powi(2);
+        let variances = Vector3::new(9e-6 * z * z, 9e-6 * z * z, depth_variance);
+        PointPair {
+            in_body,
+            body_covariance: Matrix3::from_diagonal(&variances),
+            in_world: (pose * Point3::from(in_body)).coords + noise * 3e-3,
+            world_covariance: Matrix3::identity() * 1e-5,
+        }
+    };
+    (0..count).map(pair).collect()
+}
+
+fn belief() -> Belief {
+    let state = NavState {
+        world_from_body: world_from_body() * Isometry3::rotation(Vector3::new(4e-3, -2e-3, 3e-3)),
+        velocity: Vector3::new(0.5, 0.2, -0.1),
+        gyro_bias: Vector3::zeros(),
+        accel_bias: Vector3::zeros(),
+    };
+    Belief { state, covariance: NavCovariance::identity() * 1e-4 }
+}
+
+fn units(c: &mut Criterion) {
+    let m = exp(&Vector3::new(0.3, -1.0, 2.0)).into_inner()
+        * Matrix3::new(0.9, 0.1, 0.2, -0.3, 0.8, 0.1, 0.2, 0.1, 0.7);
+    c.bench_function("unit/svd", |b| b.iter(|| black_box(&m).svd(true, true)));
+    for count in POINTS {
+        let pairs = pairs(count);
+        let weighted: Vec<WeightedPair> = pairs
+            .iter()
+            .map(|pair| WeightedPair {
+                from: pair.in_body,
+                to: pair.in_world,
+                weight: 3.0 / (pair.body_covariance + pair.world_covariance).trace(),
+            })
+            .collect();
+        c.bench_with_input(BenchmarkId::new("unit/kabsch", count), &weighted, |b, weighted| {
+            b.iter(|| weighted_kabsch(black_box(weighted).iter().copied()));
+        });
+    }
+}
+
+fn updates(c: &mut Criterion) {
+    let propagator = Propagator::inertial(&ImuConfig::default());
+    for kind in [FilterKind::Mfgr, FilterKind::Mekfr] {
+        for count in POINTS {
+            let pairs = pairs(count);
+            let mut filter = kind.start(&FilterConfig::default(), propagator.clone(), belief());
+            // The belief is set back by inflating it: an update costs the same at any belief.
+            c.bench_with_input(
+                BenchmarkId::new(format!("update/{kind}"), count),
+                &pairs,
+                |b, pairs| b.iter(|| filter.update(black_box(pairs))),
+            );
+        }
+    }
+    for count in POINTS {
+        let pairs = pairs(count);
+        c.bench_with_input(BenchmarkId::new("align", count), &pairs, |b, pairs| {
+            b.iter(|| align(black_box(pairs)).is_ok());
+        });
+    }
+}
+
+fn map(c: &mut Criterion) {
+    let propagator = Propagator::inertial(&ImuConfig::default());
+    let filter = FilterKind::Mfgr.start(&FilterConfig::default(), propagator, belief());
+    let pairs = pairs(500);
+    c.bench_function("refine/500", |b| {
+        b.iter(|| pairs.iter().filter_map(|pair| filter.refine(black_box(pair))).count());
+    });
+}
+
+fn propagation(c: &mut Criterion) {
+    let propagator = Propagator::inertial(&ImuConfig::default());
+    let sample = |nanos: i64| ImuSample {
+        stamp: Stamp::from_nanos(nanos),
+        angular_velocity: Vector3::new(0.1, -0.2, 0.3),
+        specific_force: Vector3::new(0.3, -0.2, 9.8),
+    };
+    for kind in [FilterKind::Mfgr, FilterKind::Mekfr] {
+        c.bench_function(&format!("imu-step/{kind}"), |b| {
+            b.iter_batched(
+                || kind.start(&FilterConfig::default(), propagator.clone(), belief()),
+                |mut filter| {
+                    filter.propagate(black_box(&sample(0)), black_box(&sample(5_000_000)));
+                    filter
+                },
+                criterion::BatchSize::SmallInput,
+            );
+        });
+    }
+}
+
+criterion_group!(visual, units, updates, map, propagation);
+criterion_main!(visual);
