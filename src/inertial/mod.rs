@@ -1,12 +1,17 @@
 //! Sensor time, IMU samples and their noise, and how a belief about the motion of the body is
 //! carried through the kinematics.
 
+mod directions;
 mod imu;
 mod initial;
 mod propagation;
 mod stamp;
 mod state;
 
+pub use directions::{
+    BodyDirection, DirectionConfig, DirectionFinder, Directions, GravityConfig, MagneticConfig,
+    RestConfig,
+};
 pub use imu::{ImuConfig, ImuSample, PositionFix};
 pub use initial::{InitialAttitude, StandstillCheck, StandstillConfig, attitude_from_gravity};
 pub(crate) use propagation::symmetrize;
