@@ -33,6 +33,11 @@ pub trait BayesFilter: Send {
         Err(self.cannot_use("direction"))
     }
 
+    /// Conditions the belief on a measured gyro bias: what a gyroscope shows that stands still.
+    fn update_gyro_bias(&mut self, _measured: &VectorEstimate) -> Result<(), FilterError> {
+        Err(self.cannot_use("gyro bias"))
+    }
+
     /// Conditions the belief on a measured position.
     fn update_position(&mut self, _measured: &PositionMeasurement) -> Result<(), FilterError> {
         Err(self.cannot_use("position"))

@@ -1,6 +1,6 @@
 //! The multiplicative extended Kalman filter of attitude and gyro bias.
 
-use nalgebra::{Matrix3, Matrix6, Matrix6x3, Rotation3, Vector3};
+use nalgebra::{Matrix3, Matrix6, Matrix6x3, Rotation3, Vector3, Vector6};
 
 use super::super::bayes::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorEstimate,
@@ -56,14 +56,39 @@ impl AttitudeMekf {
         super::finite("posterior", correction.as_slice())?;
         super::finite("posterior", covariance.as_slice())?;
         self.covariance = 0.5 * (covariance + covariance.transpose());
+        self.apply(&correction);
+        Ok(())
+    }
+
+    fn apply(&mut self, correction: &Vector6<f64>) {
         let turn = exp(&correction.fixed_rows::<3>(0).into_owned());
         self.attitude = match self.error {
             Frame::World => turn * self.attitude,
             Frame::Body => self.attitude * turn,
         };
         self.bias += correction.fixed_rows::<3>(3);
-        Ok(())
     }
+}
+
+/// Correction and covariance of (rotation vector, bias) after a measurement of the bias that
+/// differs by `residual` from the expected one, in Joseph's form.
+pub(super) fn conditioned_on_bias(
+    covariance: &Matrix6<f64>,
+    residual: &Vector3<f64>,
+    noise: &Matrix3<f64>,
+) -> Result<(Vector6<f64>, Matrix6<f64>), FilterError> {
+    let innovation = covariance.fixed_view::<3, 3>(3, 3) + noise;
+    let inverse = innovation.try_inverse();
+    let gain = covariance.fixed_columns::<3>(3)
+        * inverse.ok_or(FilterError::NotPositive("innovation covariance"))?;
+    let mut kept = Matrix6::identity();
+    let mut right = kept.fixed_columns_mut::<3>(3);
+    right -= gain;
+    let posterior = kept * covariance * kept.transpose() + gain * noise * gain.transpose();
+    let correction = gain * residual;
+    super::finite("posterior", correction.as_slice())?;
+    super::finite("posterior", posterior.as_slice())?;
+    Ok((correction, 0.5 * (posterior + posterior.transpose())))
 }
 
 /// Rotation and bias, uncorrelated.
@@ -115,6 +140,15 @@ impl BayesFilter for AttitudeMekf {
     fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
         let (information, vector) = linearized_directions(measured, self.error, &self.attitude)?;
         self.correct(&information, &vector)
+    }
+
+    fn update_gyro_bias(&mut self, measured: &VectorEstimate) -> Result<(), FilterError> {
+        let residual = measured.mean - self.bias;
+        let (correction, covariance) =
+            conditioned_on_bias(&self.covariance, &residual, &measured.covariance)?;
+        self.covariance = covariance;
+        self.apply(&correction);
+        Ok(())
     }
 
     fn attitude(&self) -> Rotation3<f64> {

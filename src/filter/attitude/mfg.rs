@@ -160,6 +160,40 @@ impl BayesFilter for AttitudeMfg {
         self.fuse(&added)
     }
 
+    /// Given the attitude, bias and measurement are Gaussian, and what is left of the likelihood is
+    /// `exp(pull^T v_R - v_R^T weight v_R/2)`. The first term adds to the matrix Fisher parameter;
+    /// the second one is taken at the mode, where `v_R = (tr(S) I - S) e`, as information on `e`.
+    fn update_gyro_bias(&mut self, measured: &VectorEstimate) -> Result<(), FilterError> {
+        let (prior, correlation) = (&self.belief, self.belief.correlation());
+        let conditional = prior.conditional_covariance();
+        let inverse = (conditional + measured.covariance).try_inverse();
+        let inverse = inverse.ok_or(FilterError::NotPositive("innovation covariance"))?;
+        let (p, residual) = (prior.p(), measured.mean - prior.mu());
+        let (pull, weight) = (p.transpose() * inverse * residual, p.transpose() * inverse * p);
+
+        let ProperSvd { u, s, v } = *prior.attitude().svd();
+        let forms = deviation_forms(correlation, &s);
+        let linear = Matrix3::from_column_slice((forms * pull).as_slice());
+        let tangent = Matrix3::from_diagonal(&prior.tangent_information());
+        let information = tangent * weight * tangent;
+        let half_trace = Matrix3::from_diagonal_element(0.5 * information.trace());
+        let added = u.matrix() * (linear + half_trace - information) * v.matrix().transpose();
+
+        let gain = conditional * inverse;
+        let kept = Matrix3::identity() - gain;
+        let belief = Belief::from_conditional(
+            *prior.attitude(),
+            prior.mu() + gain * residual,
+            kept * conditional * kept.transpose() + gain * measured.covariance * gain.transpose(),
+            kept * p,
+            correlation,
+        )?;
+        let mut updated = Self { belief, ..self.clone() };
+        updated.fuse(&added)?;
+        *self = updated;
+        Ok(())
+    }
+
     fn attitude(&self) -> Rotation3<f64> {
         self.belief.attitude().mode()
     }

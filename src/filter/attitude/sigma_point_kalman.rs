@@ -6,7 +6,7 @@ use super::super::bayes::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, InertialStep, VectorEstimate,
     VectorMeasurement,
 };
-use super::gaussian::joint_covariance;
+use super::gaussian::{conditioned_on_bias, joint_covariance};
 use super::{AttitudePrior, GyroModel, information_of, symmetric};
 use crate::so3::{exp, log};
 
@@ -168,6 +168,15 @@ impl BayesFilter for AttitudeUkf {
                 }
             }
         }
+        Ok(())
+    }
+
+    fn update_gyro_bias(&mut self, measured: &VectorEstimate) -> Result<(), FilterError> {
+        let residual = measured.mean - self.bias;
+        let (correction, covariance) =
+            conditioned_on_bias(&self.covariance, &residual, &measured.covariance)?;
+        self.covariance = covariance;
+        self.apply(&correction);
         Ok(())
     }
 
