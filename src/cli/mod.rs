@@ -1,5 +1,6 @@
 //! The commands: one file each, each a thin shell over the library.
 
+mod attitude;
 #[cfg(feature = "vision")]
 mod demo;
 mod evaluate;
@@ -33,6 +34,7 @@ enum Command {
     #[cfg(feature = "vision")]
     Replay(replay::Args),
     Simulate(simulate::SimulateArgs),
+    Attitude(attitude::AttitudeArgs),
     Evaluate(evaluate::EvaluateArgs),
     Experiment(experiment::ExperimentArgs),
     Gnss(gnss::GnssArgs),
@@ -48,6 +50,7 @@ pub fn main() -> ExitCode {
         #[cfg(feature = "vision")]
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(args),
+        Command::Attitude(args) => attitude::run(&args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Experiment(args) => experiment::run(&args),
         Command::Gnss(args) => gnss::run(&args),

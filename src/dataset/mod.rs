@@ -7,6 +7,7 @@
 mod bag;
 mod event;
 mod folder;
+mod imu_csv;
 mod mcap_file;
 mod merge;
 mod message;
@@ -26,6 +27,7 @@ use crate::odometry::{Event, TruthPose};
 use crate::vision::RgbdFrame;
 
 pub use event::{Log, LogConfig, LogError, LogSummary, ReadReport};
+pub use imu_csv::{ImuCsv, ImuRow};
 pub use navigation_csv::{TableError, read_imu_table, read_position_table};
 pub use open::{detect, open};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

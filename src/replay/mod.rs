@@ -1,5 +1,6 @@
 //! One replay from a log to its files and figures: the library behind `replay` and `demo`.
 
+mod attitude;
 mod evaluation;
 mod metrics;
 mod navigation;
@@ -13,6 +14,7 @@ use std::time::Instant;
 
 use nalgebra::{Isometry3, Matrix6};
 
+pub use attitude::{AttitudeMetrics, AttitudeRequest, Reached, replay_attitude};
 pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors};
 pub use metrics::{Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
@@ -44,6 +46,8 @@ pub enum ReplayError {
         "`camera.imu_from_camera` is no rigid motion (rotation and translation, row-major 4x4)"
     )]
     Extrinsics,
+    #[error("{log}: no attitude: {reason}")]
+    NoAttitude { log: PathBuf, reason: String },
     #[error("the front end cannot start: {0}")]
     FrontEnd(String),
     #[error("the recording failed: {0}")]

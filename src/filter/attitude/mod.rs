@@ -27,6 +27,7 @@
 //!   that process noise enters `uae` with a weight that depends on the concentration; the
 //!   weighted points of W22 definition 4.3 (`mfgiu`, `mfgbu`) do not have this defect.
 
+mod adaptive;
 mod bayes_fisher;
 mod fast;
 mod gaussian;
@@ -49,6 +50,7 @@ use super::bayes::{BayesFilter, FilterError, Frame, finite};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::distribution::matrix_fisher_gaussian::Correlation;
 
+pub use adaptive::{AdaptiveAttitude, AdaptiveConfig, AttitudeStep};
 pub use bayes_fisher::{BayesFisher, MomentMap};
 pub use fast::FastNonlinear;
 pub use gaussian::AttitudeMekf;
