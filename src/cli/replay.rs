@@ -67,10 +67,11 @@ pub struct Args {
 /// What `replay` and `demo` have in common.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Settings {
-    /// mfgd, mekfd (map fixed), mfgr, mekfr (map points uncertain).
+    /// mfgd, mekfd (map fixed), mfgr, mekfr (map points uncertain), mfgs, mekfs (map points
+    /// correlated with the pose).
     #[arg(long, value_name = "NAME", default_value_t = FilterKind::Mfgr)]
     filter: FilterKind,
-    /// auto, static or truth [default: init.mode of the configuration].
+    /// auto, static, truth, unknown-heading or unknown [default: init.mode of the configuration].
     #[arg(long, value_name = "MODE")]
     init: Option<InitMode>,
     /// Seed of RANSAC.

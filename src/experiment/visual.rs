@@ -307,7 +307,7 @@ fn see(
         let point = map[sighting.landmark]?;
         let world_covariance = match treatment {
             MapTreatment::Fixed => Matrix3::zeros(),
-            MapTreatment::Uncertain => point.covariance,
+            MapTreatment::Uncertain | MapTreatment::Correlated => point.covariance,
         };
         let pair = PointPair {
             in_body: sighting.in_body,

@@ -12,6 +12,7 @@ pub use bayes::{
     PositionMeasurement, VectorEstimate, VectorMeasurement,
 };
 pub use visual::{
-    FilterConfig, FilterKind, MapTreatment, Mekf, MfgFilter, Screening, UpdateMethod,
-    UpdateOutcome, VisualInertialFilter, point_by_pose, pose_covariance,
+    Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude, MapTreatment, Mekf, MfgFilter,
+    PointState, Screening, SeenPoint, SlamFilter, UpdateMethod, UpdateOutcome,
+    VisualInertialFilter, choose_points, point_by_pose, pose_covariance,
 };

@@ -56,6 +56,11 @@ impl Propagator {
         }
     }
 
+    /// Sets gravity as a vector in world coordinates, m/s^2.
+    pub fn set_gravity(&mut self, gravity: Vector3<f64>) {
+        self.gravity = gravity;
+    }
+
     pub fn model(&self) -> MotionModel {
         self.model
     }
@@ -63,13 +68,24 @@ impl Propagator {
     /// Moves `belief` from the time of `from` to the time of `to`; an interval that is not
     /// positive leaves it unchanged. So do samples that no finite belief follows from: false.
     pub fn propagate(&self, belief: &mut Belief, from: &ImuSample, to: &ImuSample) -> bool {
+        self.propagate_with_transition(belief, from, to).is_some()
+    }
+
+    /// Like [`Self::propagate`]; gives the derivative of the error after the step by the error
+    /// before it, for whoever carries correlations of the belief with something else.
+    pub fn propagate_with_transition(
+        &self,
+        belief: &mut Belief,
+        from: &ImuSample,
+        to: &ImuSample,
+    ) -> Option<NavCovariance> {
         let h = to.stamp.seconds_since(from.stamp);
         if h <= 0.0 {
-            return true;
+            return Some(NavCovariance::identity());
         }
         let angular_velocity = (from.angular_velocity + to.angular_velocity) * 0.5;
         let specific_force = (from.specific_force + to.specific_force) * 0.5;
-        self.advance(belief, &angular_velocity, &specific_force, h)
+        self.advance_with_transition(belief, &angular_velocity, &specific_force, h)
     }
 
     /// Moves `belief` over `h > 0` seconds with the measured angular velocity and specific force
@@ -81,19 +97,31 @@ impl Propagator {
         specific_force: &Vector3<f64>,
         h: f64,
     ) -> bool {
+        self.advance_with_transition(belief, angular_velocity, specific_force, h).is_some()
+    }
+
+    fn advance_with_transition(
+        &self,
+        belief: &mut Belief,
+        angular_velocity: &Vector3<f64>,
+        specific_force: &Vector3<f64>,
+        h: f64,
+    ) -> Option<NavCovariance> {
         let mut moved = *belief;
-        self.step(&mut moved, angular_velocity, specific_force, h);
-        let finite = moved.is_finite();
-        if finite {
+        let transition = self.step(&mut moved, angular_velocity, specific_force, h);
+        moved.is_finite().then(|| {
             *belief = moved;
-        }
-        finite
+            transition
+        })
     }
 
     /// Carries `belief` over `h` seconds without measurements (constant velocity model).
-    pub fn coast(&self, belief: &mut Belief, h: f64) {
+    /// Gives the derivative of the error as [`Self::propagate_with_transition`] does.
+    pub fn coast(&self, belief: &mut Belief, h: f64) -> NavCovariance {
         if h > 0.0 {
-            self.step(belief, &Vector3::zeros(), &Vector3::zeros(), h);
+            self.step(belief, &Vector3::zeros(), &Vector3::zeros(), h)
+        } else {
+            NavCovariance::identity()
         }
     }
 
@@ -129,7 +157,13 @@ impl Propagator {
         &self.gravity
     }
 
-    fn step(&self, belief: &mut Belief, gyro: &Vector3<f64>, accel: &Vector3<f64>, h: f64) {
+    fn step(
+        &self,
+        belief: &mut Belief,
+        gyro: &Vector3<f64>,
+        accel: &Vector3<f64>,
+        h: f64,
+    ) -> NavCovariance {
         let state = &mut belief.state;
         let turn = (gyro - state.gyro_bias) * h;
         let force = accel - state.accel_bias;
@@ -150,6 +184,7 @@ impl Propagator {
             Translation3::from(position),
             UnitQuaternion::new_normalize(rotation.into_inner()),
         );
+        transition
     }
 
     /// Covariance of the error that the white noises add over the step.

@@ -5,7 +5,7 @@ mod index;
 
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, Matrix3, Vector2, Vector3};
+use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::vision::{Descriptor, Patch, PinholeCamera};
@@ -66,6 +66,8 @@ pub struct MapPoint {
     pub last_seen: u64,
     /// Frames that it was seen in.
     pub observations: u32,
+    /// Whether it stays however long it is not seen: the filter's state refers to it.
+    pub held: bool,
 }
 
 /// How a point looked from one place.
@@ -148,6 +150,7 @@ impl Map {
             first_seen: sighting.frame,
             last_seen: sighting.frame,
             observations: 1,
+            held: false,
         });
         self.index.invalidate();
         Some(id)
@@ -182,6 +185,27 @@ impl Map {
         true
     }
 
+    /// Keeps a point from being pruned, or no longer. False if there is no such point.
+    pub fn hold(&mut self, id: u64, held: bool) -> bool {
+        let Some(slot) = self.slot(id) else { return false };
+        self.points[slot].held = held;
+        true
+    }
+
+    /// Turns the world, and all points with it, about the origin.
+    pub fn turn(&mut self, turn: &UnitQuaternion<f64>) {
+        let matrix = turn.to_rotation_matrix().into_inner();
+        for point in &mut self.points {
+            point.position = turn * point.position;
+            point.view_direction = turn * point.view_direction;
+            point.covariance = matrix * point.covariance * matrix.transpose();
+            if let Some(reference) = &mut point.reference {
+                reference.world_from_camera = turn * reference.world_from_camera;
+            }
+        }
+        self.index.invalidate();
+    }
+
     /// Deletes a point; false if there is none of this id.
     pub fn remove(&mut self, id: u64) -> bool {
         let Some(slot) = self.slot(id) else { return false };
@@ -191,17 +215,17 @@ impl Map {
     }
 
     /// Deletes points not seen for too long as of `frame`, then those above the size limit (see
-    /// [`MapConfig`]). Gives the number deleted.
+    /// [`MapConfig`]), those held last. Gives the number deleted.
     pub fn prune(&mut self, frame: u64) -> usize {
         let before = self.points.len();
         let oldest = frame.saturating_sub(self.config.max_unseen_frames);
-        self.points.retain(|point| point.last_seen >= oldest);
+        self.points.retain(|point| point.held || point.last_seen >= oldest);
         let excess = self.points.len().saturating_sub(self.config.max_points);
         if excess > 0 {
-            let worth = |p: &MapPoint| (p.last_seen, p.observations, p.id);
+            let worth = |p: &MapPoint| (p.held, p.last_seen, p.observations, p.id);
             let mut order: Vec<_> = self.points.iter().map(worth).collect();
             order.sort_unstable();
-            let mut doomed: Vec<_> = order[..excess].iter().map(|worth| worth.2).collect();
+            let mut doomed: Vec<_> = order[..excess].iter().map(|worth| worth.3).collect();
             doomed.sort_unstable();
             self.points.retain(|point| doomed.binary_search(&point.id).is_err());
         }
@@ -257,7 +281,6 @@ fn direction(from: &Vector3<f64>, to: &Vector3<f64>) -> Option<Vector3<f64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::UnitQuaternion;
     use proptest::prelude::*;
 
     const CAMERA: PinholeCamera = PinholeCamera { fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 };

@@ -7,7 +7,7 @@ use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::truth::{TruthConfig, TruthTrack, Up, z_up_from_reference};
-use crate::filter::FilterConfig;
+use crate::filter::{FilterConfig, KnownAttitude};
 use crate::inertial::{
     Belief, ImuConfig, ImuSample, InitialAttitude, NavCovariance, NavState, Stamp, StandstillCheck,
     StandstillConfig, block,
@@ -23,16 +23,23 @@ pub enum InitMode {
     Static,
     /// `static` if the IMU stands still at first, else gravity from the mean of the first window.
     Auto,
+    /// Gravity as `auto` finds it, heading uniform.
+    UnknownHeading,
+    /// Attitude uniform; starts with the first frame.
+    Unknown,
 }
 
 impl InitMode {
-    pub const ALL: [Self; 3] = [Self::Auto, Self::Static, Self::Truth];
+    pub const ALL: [Self; 5] =
+        [Self::Auto, Self::Static, Self::Truth, Self::UnknownHeading, Self::Unknown];
 
     pub fn name(self) -> &'static str {
         match self {
             Self::Truth => "truth",
             Self::Static => "static",
             Self::Auto => "auto",
+            Self::UnknownHeading => "unknown-heading",
+            Self::Unknown => "unknown",
         }
     }
 }
@@ -58,7 +65,7 @@ impl FromStr for InitMode {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct InitConfig {
-    /// `auto`, `static` or `truth`; `--init` overrides it.
+    /// `auto`, `static`, `truth`, `unknown-heading` or `unknown`; `--init` overrides it.
     pub mode: InitMode,
     /// Length of IMU data that a moving start is levelled with, s.
     pub moving_window: f64,
@@ -81,6 +88,7 @@ pub enum Attempt {
     NextFrame(String),
     Ready {
         belief: Box<Belief>,
+        known: KnownAttitude,
         how: String,
     },
 }
@@ -117,6 +125,15 @@ impl Initializer {
             InitMode::Static | InitMode::Auto => match evidence.imu {
                 Some(imu) => self.with_imu(evidence, imu),
                 None => self.without_imu(),
+            },
+            InitMode::UnknownHeading | InitMode::Unknown => match evidence.imu {
+                None => Attempt::NextFrame(
+                    "without an IMU nothing tells which way is up; use `--init auto`".to_owned(),
+                ),
+                Some(imu) if self.init.mode == InitMode::UnknownHeading => {
+                    self.with_imu(evidence, imu)
+                }
+                Some(_) => self.in_first_body_frame(),
             },
         }
     }
@@ -162,7 +179,7 @@ impl Initializer {
         belief.state.world_from_body = world_from_body;
         belief.state.velocity = velocity.unwrap_or_default();
         let how = format!("from the reference pose at {first} s");
-        Attempt::Ready { belief: Box::new(belief), how }
+        Attempt::Ready { belief: Box::new(belief), known: KnownAttitude::All, how }
     }
 
     fn z_up_from_truth(
@@ -240,7 +257,11 @@ impl Initializer {
         } else {
             format!("moving ({explained}): levelled by the mean of the specific force")
         };
-        Attempt::Ready { belief: Box::new(belief), how }
+        let known = match self.init.mode {
+            InitMode::UnknownHeading => KnownAttitude::Vertical,
+            _ => KnownAttitude::All,
+        };
+        Attempt::Ready { belief: Box::new(belief), known, how }
     }
 
     fn without_imu(&self) -> Attempt {
@@ -250,7 +271,26 @@ impl Initializer {
             covariance: Matrix3::identity() * self.filter.heading_sd_deg.to_radians().powi(2),
         };
         let belief = self.belief(&attitude, self.filter.moving_velocity_sd, false);
-        Attempt::Ready { belief: Box::new(belief), how: "no IMU: level, at the origin".to_owned() }
+        Attempt::Ready {
+            belief: Box::new(belief),
+            known: KnownAttitude::All,
+            how: "no IMU: level, at the origin".to_owned(),
+        }
+    }
+
+    /// The world is the body's frame at the first frame; its attitude there is known but for the
+    /// standard deviation that any start gives the heading.
+    fn in_first_body_frame(&self) -> Attempt {
+        let attitude = InitialAttitude {
+            world_from_body: UnitQuaternion::identity(),
+            gyro_bias: Vector3::zeros(),
+            covariance: Matrix3::identity() * self.filter.heading_sd_deg.to_radians().powi(2),
+        };
+        Attempt::Ready {
+            belief: Box::new(self.belief(&attitude, self.filter.moving_velocity_sd, true)),
+            known: KnownAttitude::Nothing { gravity: self.imu.gravity },
+            how: "attitude unknown: in the frame of the body until gravity is found".to_owned(),
+        }
     }
 
     /// Belief at the origin with the given attitude.

@@ -5,6 +5,7 @@ mod init;
 mod pipeline;
 mod report;
 mod runner;
+mod state_points;
 mod truth;
 
 use serde::{Deserialize, Serialize};
@@ -21,6 +22,7 @@ pub use report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
 pub use runner::{FrontEnd, Observation, RunOptions, run};
+pub use state_points::renew_state_points;
 pub use truth::{TruthConfig, TruthTrack, Up, z_up_from_reference};
 
 /// Where in the image a map point is looked for.

@@ -8,9 +8,12 @@ use super::report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
 use super::truth::TruthTrack;
-use super::{OdometryConfig, TruthPose};
+use super::{OdometryConfig, TruthPose, renew_state_points};
 use crate::alignment::PointPair;
-use crate::filter::{FilterKind, MapTreatment, UpdateOutcome, VisualInertialFilter, point_by_pose};
+use crate::filter::{
+    FilterKind, KnownAttitude, MapTreatment, SeenPoint, UpdateOutcome, VisualInertialFilter,
+    point_by_pose,
+};
 use crate::inertial::{Belief, ImuSample, Propagator, Stamp};
 use crate::map::{Map, MapPoint, ReferenceView, Sighting};
 use crate::vision::{
@@ -215,18 +218,18 @@ impl Odometry {
                 self.stats.frames_before_initialization += 1;
                 Some(None)
             }
-            Attempt::Ready { belief, how } => {
+            Attempt::Ready { belief, known, how } => {
                 let text = format!("initialised at {first_frame} s: {how}");
                 tracing::info!("{text}");
                 self.stats.initialization = Some(how);
                 self.waiting_reason = None;
-                self.start(*belief, first_frame);
+                self.start(*belief, known, first_frame);
                 Some(Some(Note { level: NoteLevel::Info, text }))
             }
         }
     }
 
-    fn start(&mut self, belief: Belief, time: Stamp) {
+    fn start(&mut self, belief: Belief, known: KnownAttitude, time: Stamp) {
         let filter = &self.config.filter;
         let propagator = if self.has_imu {
             Propagator::inertial(&self.config.imu)
@@ -238,7 +241,7 @@ impl Odometry {
             last_imu = self.imu.pop_front();
         }
         self.running = Some(Running {
-            filter: self.kind.start(filter, propagator, belief),
+            filter: self.kind.start_knowing(known, filter, propagator, belief),
             map: Map::new(&self.config.map),
             last_imu: last_imu.map(|sample| ImuSample { stamp: time, ..sample }),
             time,
@@ -293,7 +296,7 @@ impl Odometry {
             frame: number,
             stamp: front.frame.stamp,
             state: belief.state,
-            covariance: belief.covariance,
+            covariance: running.filter.reported_covariance(),
             world_from_camera: belief.state.world_from_body * self.body_from_camera,
             matrix_fisher: running.filter.matrix_fisher(),
             innovation: updated.map(|outcome| outcome.innovation),
@@ -503,15 +506,27 @@ impl Running {
             .filter_map(|&i| matches.get(i))
             .map(|m| (m.point, point_pair(&m.correspondence, view)))
             .collect();
-        let only_pairs: Vec<_> = pairs.iter().map(|(_, pair)| *pair).collect();
-        let outcome = self.filter.update(&only_pairs)?;
-        if treatment == MapTreatment::Uncertain {
+        let outcome = match self.filter.point_state() {
+            Some(points) => {
+                let seen: Vec<_> = pairs.iter().map(|(id, pair)| seen_point(*id, pair)).collect();
+                points.measure(&seen)?
+            }
+            None => {
+                let only_pairs: Vec<_> = pairs.iter().map(|(_, pair)| *pair).collect();
+                self.filter.update(&only_pairs)?
+            }
+        };
+        let turn = self.filter.take_world_turn();
+        if treatment != MapTreatment::Fixed && turn.is_none() {
             let entered = pairs.iter().zip(self.filter.passed()).filter(|(_, passed)| **passed);
             for ((id, pair), _) in entered {
                 if let Some(refined) = self.filter.refine(pair) {
                     self.map.relocate(*id, refined.position, refined.covariance);
                 }
             }
+        }
+        if let Some(turn) = turn {
+            self.map.turn(&turn);
         }
         Some(outcome)
     }
@@ -539,6 +554,7 @@ impl Running {
             None => KeypointRole::NoDepth,
         };
         let mut fates: Vec<_> = features.iter().map(|f| Fate::of(unmatched(f))).collect();
+        let mut seen = Vec::new();
         for (m, accepted) in matches.iter().zip(membership(inliers, matches.len())) {
             let role = if accepted { KeypointRole::Inlier } else { KeypointRole::Outlier };
             fates[m.feature] = Fate { role, matched: Some((m.point, m.predicted)) };
@@ -548,6 +564,9 @@ impl Running {
                     .filter(|_| m.renews_reference)
                     .and_then(|point| reference(feature, point, &world_from_camera, view));
                 self.map.observe(m.point, &sighting(feature, reference));
+                if feature.depth.is_some() {
+                    seen.push(seen_point(m.point, &point_pair(&m.correspondence, view)));
+                }
             }
         }
         for (feature, fate) in features.iter().zip(&mut fates) {
@@ -559,9 +578,14 @@ impl Running {
             let estimate = self.filter.insert(treatment, &in_body, &covariance);
             let reference = first_reference(feature, &world_from_camera);
             let sighting = sighting(feature, reference);
-            if self.map.insert(estimate.position, estimate.covariance, &sighting).is_some() {
+            let inserted = self.map.insert(estimate.position, estimate.covariance, &sighting);
+            if let Some(id) = inserted {
                 fate.role = KeypointRole::New;
+                seen.push(SeenPoint { id, in_body, body_covariance: covariance });
             }
+        }
+        if let Some(points) = self.filter.point_state() {
+            renew_state_points(points, &mut self.map, &seen, number, &view.config.filter);
         }
         self.map.prune(number);
         fates
@@ -660,6 +684,10 @@ fn in_body(measurement: &PointMeasurement, view: &View) -> (Vector3<f64>, Matrix
     let covariance = rotation.matrix() * measurement.covariance * rotation.matrix().transpose();
     let point = (view.body_from_camera * Point3::from(measurement.point)).coords;
     (point, covariance * view.config.filter.measurement_inflation)
+}
+
+fn seen_point(id: u64, pair: &PointPair) -> SeenPoint {
+    SeenPoint { id, in_body: pair.in_body, body_covariance: pair.body_covariance }
 }
 
 fn point_pair(correspondence: &Correspondence, view: &View) -> PointPair {

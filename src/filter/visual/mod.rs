@@ -2,13 +2,17 @@
 
 mod broad;
 mod gate;
+mod gravity;
 mod mekf;
 mod mfg;
+mod regression;
+mod selection;
+mod slam;
 
 use std::fmt;
 use std::str::FromStr;
 
-use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
+use nalgebra::{Matrix3, Matrix6, SMatrix, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::alignment::{MapEstimate, PointPair, PoseInformation, RobustKernel};
@@ -18,6 +22,9 @@ use crate::so3::ProperSvd;
 
 pub use mekf::Mekf;
 pub use mfg::MfgFilter;
+pub use regression::Coordinates;
+pub use selection::{Candidate, choose_points};
+pub use slam::SlamFilter;
 
 /// What the filter assumes of map points once they are in the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -28,6 +35,9 @@ pub enum MapTreatment {
     /// A point is a Gaussian of its own, independent of the pose, and every measurement refines
     /// it (`mfgr`, `mekfr`; W22 5.2.3).
     Uncertain,
+    /// Points in use are part of the filter's state (`mfgs`, `mekfs`); the others, out of which
+    /// they are chosen, are treated as uncertain and do not touch the belief.
+    Correlated,
 }
 
 /// The filters of `replay --filter`.
@@ -36,19 +46,24 @@ pub enum MapTreatment {
 pub enum FilterKind {
     Mfgd,
     Mfgr,
+    Mfgs,
     Mekfd,
     Mekfr,
+    Mekfs,
 }
 
 impl FilterKind {
-    pub const ALL: [Self; 4] = [Self::Mfgr, Self::Mfgd, Self::Mekfr, Self::Mekfd];
+    pub const ALL: [Self; 6] =
+        [Self::Mfgr, Self::Mfgd, Self::Mfgs, Self::Mekfr, Self::Mekfd, Self::Mekfs];
 
     pub fn name(self) -> &'static str {
         match self {
             Self::Mfgd => "mfgd",
             Self::Mfgr => "mfgr",
+            Self::Mfgs => "mfgs",
             Self::Mekfd => "mekfd",
             Self::Mekfr => "mekfr",
+            Self::Mekfs => "mekfs",
         }
     }
 
@@ -56,6 +71,7 @@ impl FilterKind {
         match self {
             Self::Mfgd | Self::Mekfd => MapTreatment::Fixed,
             Self::Mfgr | Self::Mekfr => MapTreatment::Uncertain,
+            Self::Mfgs | Self::Mekfs => MapTreatment::Correlated,
         }
     }
 
@@ -69,6 +85,10 @@ impl FilterKind {
         match self {
             Self::Mfgd | Self::Mfgr => Box::new(MfgFilter::new(config, propagator, belief)),
             Self::Mekfd | Self::Mekfr => Box::new(Mekf::new(config, propagator, belief)),
+            Self::Mfgs => Box::new(SlamFilter::new(config, Coordinates::Group, propagator, belief)),
+            Self::Mekfs => {
+                Box::new(SlamFilter::new(config, Coordinates::Additive, propagator, belief))
+            }
         }
     }
 
@@ -85,9 +105,56 @@ impl FilterKind {
             Self::Mfgd | Self::Mfgr => {
                 Box::new(MfgFilter::broad(config, propagator, belief, attitude))
             }
-            Self::Mekfd | Self::Mekfr => self.start(config, propagator, belief),
+            Self::Mekfd | Self::Mekfr | Self::Mfgs | Self::Mekfs => {
+                self.start(config, propagator, belief)
+            }
         }
     }
+}
+
+impl FilterKind {
+    /// A filter of this kind that starts from `belief`, of whose attitude only `known` is known.
+    ///
+    /// Filters that hold no density but a Gaussian get the variance of what is unknown.
+    pub fn start_knowing(
+        self,
+        known: KnownAttitude,
+        config: &FilterConfig,
+        propagator: Propagator,
+        mut belief: Belief,
+    ) -> Box<dyn VisualInertialFilter> {
+        let slam =
+            |propagator, belief| SlamFilter::new(config, Coordinates::Group, propagator, belief);
+        match (self, known) {
+            (_, KnownAttitude::All) => self.start(config, propagator, belief),
+            (Self::Mfgs, KnownAttitude::Vertical) => {
+                Box::new(slam(propagator, belief).with_free_heading())
+            }
+            (Self::Mfgs, KnownAttitude::Nothing { gravity }) => {
+                Box::new(slam(propagator, belief).with_unknown_gravity(gravity))
+            }
+            (_, KnownAttitude::Vertical) => self.start(config, propagator, belief),
+            (_, KnownAttitude::Nothing { .. }) => {
+                belief
+                    .covariance
+                    .fixed_view_mut::<3, 3>(block::ROTATION, block::ROTATION)
+                    .copy_from(&(Matrix3::identity() * gravity::UNIFORM_VARIANCE));
+                self.start(config, propagator, belief)
+            }
+        }
+    }
+}
+
+/// What is known of the attitude at the start.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum KnownAttitude {
+    /// Heading and vertical, as well as the belief says.
+    All,
+    /// The vertical; the world's heading is arbitrary.
+    Vertical,
+    /// Nothing: the belief is in the frame of the body, where gravity (magnitude, m/s^2) has any
+    /// direction.
+    Nothing { gravity: f64 },
 }
 
 impl fmt::Display for FilterKind {
@@ -134,6 +201,12 @@ pub struct FilterConfig {
     /// Factor on the covariance of every point measurement, for what the sensor model leaves out
     /// (errors shared by neighbouring points).
     pub measurement_inflation: f64,
+    /// Most map points in the state of `mfgs` and `mekfs`.
+    pub state_points: usize,
+    /// Frames that a point must have been seen in to enter the state, while there are such.
+    pub state_min_observations: u32,
+    /// Points of the state not seen for more than this many frames make room for others.
+    pub state_max_unseen_frames: u64,
     /// Standard deviation of the initial velocity, m/s.
     pub velocity_sd: f64,
     /// Standard deviation of the initial position, m.
@@ -162,6 +235,9 @@ impl Default for FilterConfig {
             update_method: UpdateMethod::Exact,
             relinearizations: 2,
             measurement_inflation: 1.0,
+            state_points: 60,
+            state_min_observations: 3,
+            state_max_unseen_frames: 10,
             velocity_sd: 0.1,
             position_sd: 1e-3,
             tilt_sd_deg: 1.0,
@@ -236,6 +312,56 @@ pub trait VisualInertialFilter: Send {
     fn world_point(&self, in_body: &Vector3<f64>) -> MapEstimate {
         world_point(self.belief(), in_body)
     }
+
+    /// Covariance of the belief in an upright world, its heading being that of the state. Differs
+    /// from that of [`Self::belief`] while it is not known which way is up.
+    fn reported_covariance(&self) -> NavCovariance {
+        self.belief().covariance
+    }
+
+    /// The turn of the world about its origin since the last call, if it was turned: whatever is
+    /// kept in world coordinates outside of the filter must follow.
+    fn take_world_turn(&mut self) -> Option<UnitQuaternion<f64>> {
+        None
+    }
+
+    /// The map points of the state, if the filter keeps any there.
+    fn point_state(&mut self) -> Option<&mut dyn PointState> {
+        None
+    }
+}
+
+/// A map point that a filter's state holds, or is to hold, seen from the body.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SeenPoint {
+    pub id: u64,
+    /// Body coordinates, m.
+    pub in_body: Vector3<f64>,
+    /// Covariance of the measurement in body coordinates, m^2.
+    pub body_covariance: Matrix3<f64>,
+}
+
+/// Map points as part of a filter's state, correlated with the pose and with each other.
+pub trait PointState {
+    /// How many more points may be admitted.
+    fn free_slots(&self) -> usize;
+
+    /// The points held, in order of admission.
+    fn ids(&self) -> Vec<u64>;
+
+    /// Marginal of a point held.
+    fn estimate(&self, id: u64) -> Option<MapEstimate>;
+
+    /// Conditions the belief on points held that were seen again; others are passed over. `None`,
+    /// and no change, without points or if no finite belief follows from them.
+    fn measure(&mut self, seen: &[SeenPoint]) -> Option<UpdateOutcome>;
+
+    /// Takes a point into the state by a measurement that the belief does not know of yet. False,
+    /// and no change, if there is no room, it is held already, or it is not finite.
+    fn admit(&mut self, point: &SeenPoint) -> bool;
+
+    /// Marginalizes a point out: what the belief learned by it stays. False if it is not held.
+    fn release(&mut self, id: u64) -> bool;
 }
 
 impl dyn VisualInertialFilter + '_ {
@@ -258,7 +384,7 @@ impl dyn VisualInertialFilter + '_ {
         let seen = self.world_point(in_body);
         let covariance = match treatment {
             MapTreatment::Fixed => measured,
-            MapTreatment::Uncertain => measured + seen.covariance,
+            MapTreatment::Uncertain | MapTreatment::Correlated => measured + seen.covariance,
         };
         MapEstimate { position: seen.position, covariance }
     }

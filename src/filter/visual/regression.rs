@@ -1,0 +1,389 @@
+//! The regression of the Euclidean state on the rotation, and how points condition it.
+
+use nalgebra::{DMatrix, Matrix3, Rotation3, SMatrix, SVector, Vector3};
+
+use crate::distribution::rotation_quadratic::{
+    RotationQuadratic, rotated_vector_by_rotation, vectorize,
+};
+use crate::so3;
+
+/// Blocks of the Euclidean part that are no vectors of the world but of the body.
+const BIASES: std::ops::Range<usize> = 2..4;
+/// The position's block of the Euclidean part.
+const POSITION: usize = 1;
+/// Points that are conditioned on at once. Their innovations are decorrelated by substitution,
+/// whose cost grows with the size of the batch; all that follows is matrix products.
+const BATCH: usize = 16;
+
+/// What the Euclidean part is regressed on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Coordinates {
+    /// On the rotation matrix: a world vector is `y = R R^T_hat y_hat + B r + noise`,
+    /// `r = vec(R)`, with a matrix Fisher density of `R`. A common turn of body and map is
+    /// `R -> G R`, under which this form keeps its parameters: turning what cannot be observed
+    /// changes nothing that is measured.
+    Group,
+    /// On the rotation vector at the estimate, as an extended Kalman filter does:
+    /// `y = y_hat + B e + noise`.
+    Additive,
+}
+
+/// A point measured in the body frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Measurement {
+    /// Body coordinates, m.
+    pub in_body: Vector3<f64>,
+    /// Body coordinates, m^2.
+    pub body_covariance: Matrix3<f64>,
+    pub target: Target,
+}
+
+/// What was measured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Target {
+    /// A block of the Euclidean part.
+    State { block: usize },
+    /// A point known independently of the state, world coordinates (m, m^2).
+    Known { position: Vector3<f64>, covariance: Matrix3<f64> },
+}
+
+/// Density of the rotation and the Euclidean part `x` given it (W22 chapter 3, with the
+/// regression kept whole): with `y = (vec(R) - vec(R_hat), 1)` or `(e, 1)`,
+///
+/// `x = x_0(R) + slope y + noise(covariance)`, `-2 log p(R) = -2 log p_0(R) + y^T evidence y`.
+///
+/// `x_0` is that of [`Coordinates`]. A point measured at `p'` has the residual
+/// `R p' + p - l = R q + (p - p_0(R)) - (l - l_0(R))`, where `q` is the residual at the estimate
+/// in body coordinates. As its covariance `A` turns with the body, `R q` is weighed by
+/// `R A^-1 R^T` and says nothing about `R`: in the evidence it stands at the estimate, and what it
+/// moves in `x` turns with `R`. (Turning `R q` under a weight that does not turn would add
+/// information about `R` with every anisotropic measurement, whatever is measured.)
+pub(super) struct Regression<'a> {
+    coordinates: Coordinates,
+    prior: &'a Rotation3<f64>,
+    prior_means: &'a [Vector3<f64>],
+    rotation_information: Matrix3<f64>,
+    rotation_covariance: Matrix3<f64>,
+    slope: DMatrix<f64>,
+    covariance: DMatrix<f64>,
+    evidence: DMatrix<f64>,
+}
+
+/// Mode of the rotation, the Euclidean part there, and the covariance of (body-frame rotation
+/// error, Euclidean part).
+pub(super) struct Posterior {
+    pub mode: Rotation3<f64>,
+    pub means: Vec<Vector3<f64>>,
+    pub covariance: DMatrix<f64>,
+}
+
+/// How well measurements fitted what was known before them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Fit {
+    /// Squared normalised innovation per degree of freedom.
+    pub innovation: f64,
+    /// Largest squared Mahalanobis distance of a single point.
+    pub largest: f64,
+}
+
+impl<'a> Regression<'a> {
+    /// Of a concentrated belief: the mode of the rotation, the means of the blocks of three of
+    /// the Euclidean part, and the covariance of both. `None` if the rotation's is not positive
+    /// definite.
+    pub fn of_prior(
+        coordinates: Coordinates,
+        prior: &'a Rotation3<f64>,
+        prior_means: &'a [Vector3<f64>],
+        covariance: &DMatrix<f64>,
+    ) -> Option<Self> {
+        let n = covariance.ncols() - 3;
+        let rotation_covariance = covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        let rotation_information = rotation_covariance.cholesky()?.inverse();
+        let cross = covariance.view((3, 0), (n, 3));
+        let mut by_rotation = cross * rotation_information;
+        let mut conditional = covariance.view((3, 3), (n, n)).into_owned();
+        conditional.gemm(-1.0, &by_rotation, &cross.transpose(), 1.0);
+
+        let mut sum = Self {
+            coordinates,
+            prior,
+            prior_means,
+            rotation_information,
+            rotation_covariance,
+            slope: DMatrix::zeros(n, coordinates.size()),
+            covariance: conditional,
+            evidence: DMatrix::zeros(coordinates.size(), coordinates.size()),
+        };
+        for (k, mean) in prior_means.iter().enumerate().filter(|(k, _)| sum.turns(*k)) {
+            let in_body = prior.inverse() * mean;
+            let mut rows = by_rotation.fixed_view_mut::<3, 3>(3 * k, 0);
+            rows += prior.matrix() * in_body.cross_matrix();
+        }
+        match coordinates {
+            Coordinates::Group => {
+                let concentration = concentration(&rotation_information);
+                // The tangent coordinate grows as the information times the rotation error.
+                let error =
+                    rotation_covariance * tangent_coordinate(prior.matrix(), &concentration);
+                sum.slope.columns_mut(0, 9).copy_from(&(by_rotation * error));
+            }
+            Coordinates::Additive => sum.slope.columns_mut(0, 3).copy_from(&by_rotation),
+        }
+        Some(sum)
+    }
+
+    /// Whether a block of `x_0` turns with the body.
+    fn turns(&self, block: usize) -> bool {
+        self.coordinates == Coordinates::Group && !BIASES.contains(&block)
+    }
+
+    /// Bayes' rule. Covariances are
+    /// turned to the world by `weighted_at`, and inflated so that weights fall by Huber's law
+    /// beyond a Mahalanobis distance of `huber` (0: never).
+    pub fn condition(
+        &mut self,
+        measurements: &[Measurement],
+        weighted_at: &Rotation3<f64>,
+        huber: f64,
+    ) -> Option<Fit> {
+        let at_prior = self.coordinates.at_prior();
+        let derivative = self.coordinates.derivative(self.prior);
+        let (noises, distances): (Vec<_>, Vec<_>) = measurements
+            .iter()
+            .map(|m| self.noise(m, weighted_at, huber, &at_prior, &derivative))
+            .collect::<Option<Vec<_>>>()?
+            .into_iter()
+            .unzip();
+        for (batch, noises) in measurements.chunks(BATCH).zip(noises.chunks(BATCH)) {
+            self.condition_batch(batch, noises)?;
+        }
+
+        let total = (at_prior.transpose() * &self.evidence * &at_prior)[(0, 0)];
+        let gradient = derivative.transpose() * &self.evidence * &at_prior;
+        let information = derivative.transpose() * &self.evidence * &derivative;
+        let information = self.rotation_information + information.fixed_view::<3, 3>(0, 0);
+        let explained = information.cholesky()?.solve(&gradient.fixed_view::<3, 1>(0, 0));
+        let explained = gradient.fixed_view::<3, 1>(0, 0).dot(&explained);
+        let innovation = (total - explained).max(0.0) / (3.0 * measurements.len() as f64);
+        Some(Fit { innovation, largest: distances.into_iter().fold(0.0, f64::max) })
+    }
+
+    /// Covariance of a measurement in world coordinates, as robust weighting leaves it, and its
+    /// squared Mahalanobis distance.
+    fn noise(
+        &self,
+        measurement: &Measurement,
+        weighted_at: &Rotation3<f64>,
+        huber: f64,
+        at_prior: &DMatrix<f64>,
+        derivative: &DMatrix<f64>,
+    ) -> Option<(Matrix3<f64>, f64)> {
+        let turn = weighted_at.matrix();
+        let mut noise = turn * measurement.body_covariance * turn.transpose();
+        if let Target::Known { covariance, .. } = measurement.target {
+            noise += covariance;
+        }
+        let rows = self.design(measurement);
+        let residual = (&rows * at_prior).fixed_view::<3, 1>(0, 0).into_owned();
+        let by_rotation = (rows * derivative).fixed_view::<3, 3>(0, 0).into_owned();
+        let block = |a: usize, b: usize| self.covariance.fixed_view::<3, 3>(3 * a, 3 * b);
+        let mut spread = block(POSITION, POSITION)
+            + by_rotation * self.rotation_covariance * by_rotation.transpose()
+            + noise;
+        if let Target::State { block: l } = measurement.target {
+            spread += block(l, l) - block(l, POSITION) - block(POSITION, l);
+        }
+        let squared = residual.dot(&spread.cholesky()?.solve(&residual));
+        let distance = squared.sqrt();
+        let robust = huber > 0.0 && distance > huber;
+        Some((if robust { noise * (distance / huber) } else { noise }, squared))
+    }
+
+    /// Derivative by `y` of the residual `R p' + p - l`, the regression of `x` included (3 x c).
+    fn design(&self, measurement: &Measurement) -> DMatrix<f64> {
+        let position = self.prior_means[POSITION];
+        let mut rows = self.slope.rows(3 * POSITION, 3).into_owned();
+        let target = match measurement.target {
+            Target::State { block } => {
+                rows -= self.slope.rows(3 * block, 3);
+                self.prior_means[block]
+            }
+            Target::Known { position, .. } => position,
+        };
+        let expected = self.prior.inverse() * (target - position);
+        let last = rows.ncols() - 1;
+        match self.coordinates {
+            Coordinates::Group => {
+                // A point of the state turns with the body by itself, a known one stays.
+                if let Target::Known { .. } = measurement.target {
+                    let in_body = self.prior.inverse() * target;
+                    for i in 0..3 {
+                        for k in 0..3 {
+                            rows[(i, 3 * k + i)] += in_body[k];
+                        }
+                    }
+                }
+            }
+            Coordinates::Additive => {
+                let mut turn = rows.fixed_view_mut::<3, 3>(0, 0);
+                turn -= self.prior.matrix() * expected.cross_matrix();
+            }
+        }
+        let mut column = rows.fixed_view_mut::<3, 1>(0, last);
+        column += self.prior * (measurement.in_body - expected);
+        rows
+    }
+
+    fn condition_batch(&mut self, batch: &[Measurement], noises: &[Matrix3<f64>]) -> Option<()> {
+        let (n, m) = (self.covariance.ncols(), 3 * batch.len());
+        // Covariance of x and the innovations, columns of which are contiguous.
+        let mut cross = DMatrix::zeros(n, m);
+        let mut design = DMatrix::zeros(m, self.coordinates.size());
+        for (i, measurement) in batch.iter().enumerate() {
+            let mut columns = cross.columns_mut(3 * i, 3);
+            columns.copy_from(&self.covariance.columns(3 * POSITION, 3));
+            if let Target::State { block } = measurement.target {
+                columns -= self.covariance.columns(3 * block, 3);
+            }
+            design.rows_mut(3 * i, 3).copy_from(&self.design(measurement));
+        }
+        let mut innovation = DMatrix::zeros(m, m);
+        for (i, (measurement, noise)) in batch.iter().zip(noises).enumerate() {
+            let mut rows = innovation.rows_mut(3 * i, 3);
+            rows.copy_from(&cross.rows(3 * POSITION, 3));
+            if let Target::State { block } = measurement.target {
+                rows -= cross.rows(3 * block, 3);
+            }
+            let mut own = innovation.fixed_view_mut::<3, 3>(3 * i, 3 * i);
+            own += noise;
+        }
+        let factor = innovation.cholesky()?.unpack();
+        // Decorrelated innovations: the columns of `cross L^-T`.
+        for j in 0..m {
+            let (before, mut from_j) = cross.columns_range_pair_mut(0..j, j..m);
+            let mut column = from_j.column_mut(0);
+            for i in 0..j {
+                column.axpy(-factor[(j, i)], &before.column(i), 1.0);
+            }
+            column /= factor[(j, j)];
+        }
+        factor.solve_lower_triangular_mut(&mut design).then_some(())?;
+
+        self.covariance.gemm(-1.0, &cross, &cross.transpose(), 1.0);
+        self.slope.gemm(-1.0, &cross, &design, 1.0);
+        self.evidence += design.transpose() * &design;
+        Some(())
+    }
+
+    /// The concentrated belief with this density's mode and curvature.
+    pub fn posterior(self) -> Option<Posterior> {
+        let (mode, information) = match self.coordinates {
+            Coordinates::Group => self.rotation_density().mode(self.prior)?,
+            Coordinates::Additive => self.additive_mode()?,
+        };
+        let rotation_covariance = information.cholesky()?.inverse();
+        let last = self.coordinates.size() - 1;
+        let shift = self.slope.column(last).into_owned();
+        let slope = self.slope.columns(0, last);
+        let moved = match self.coordinates {
+            Coordinates::Group => {
+                slope * (vectorize(mode.matrix()) - vectorize(self.prior.matrix()))
+            }
+            Coordinates::Additive => slope * so3::log(&(self.prior.inverse() * mode)),
+        };
+        let mut by_rotation = slope * self.coordinates.derivative(&mode).rows(0, last);
+        let mut means = self.prior_means.to_vec();
+        for (k, mean) in means.iter_mut().enumerate() {
+            *mean += shift.fixed_rows::<3>(3 * k);
+            if self.turns(k) {
+                let in_body = self.prior.inverse() * *mean;
+                *mean = mode * in_body;
+                let mut rows = by_rotation.fixed_view_mut::<3, 3>(3 * k, 0);
+                rows -= mode.matrix() * in_body.cross_matrix();
+            }
+            *mean += moved.fixed_rows::<3>(3 * k);
+        }
+
+        let n = self.covariance.ncols();
+        let cross = &by_rotation * rotation_covariance;
+        let mut euclidean = self.covariance;
+        euclidean.gemm(1.0, &cross, &by_rotation.transpose(), 1.0);
+        let mut covariance = DMatrix::zeros(n + 3, n + 3);
+        covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation_covariance);
+        covariance.view_mut((3, 0), (n, 3)).copy_from(&cross);
+        covariance.view_mut((0, 3), (3, n)).copy_from(&cross.transpose());
+        for j in 0..n {
+            for i in 0..=j {
+                let mean = 0.5 * (euclidean[(i, j)] + euclidean[(j, i)]);
+                covariance[(i + 3, j + 3)] = mean;
+                covariance[(j + 3, i + 3)] = mean;
+            }
+        }
+        Some(Posterior { mode, means, covariance })
+    }
+
+    /// Matrix Fisher prior times the evidence.
+    fn rotation_density(&self) -> RotationQuadratic {
+        let prior = self.prior.matrix() * concentration(&self.rotation_information);
+        let quadratic: SMatrix<f64, 9, 9> = self.evidence.fixed_view::<9, 9>(0, 0).into_owned();
+        let linear: SVector<f64, 9> = vectorize(&prior)
+            + quadratic * vectorize(self.prior.matrix())
+            - self.evidence.fixed_view::<9, 1>(0, 9);
+        RotationQuadratic { linear, quadratic }
+    }
+
+    fn additive_mode(&self) -> Option<(Rotation3<f64>, Matrix3<f64>)> {
+        let information = self.rotation_information + self.evidence.fixed_view::<3, 3>(0, 0);
+        let error = -information.cholesky()?.solve(&self.evidence.fixed_view::<3, 1>(0, 3));
+        Some((self.prior * Rotation3::new(error), information))
+    }
+}
+
+impl Coordinates {
+    /// Length of `y`.
+    fn size(self) -> usize {
+        match self {
+            Self::Group => 10,
+            Self::Additive => 4,
+        }
+    }
+
+    /// `y` at the estimate.
+    fn at_prior(self) -> DMatrix<f64> {
+        let mut y = DMatrix::zeros(self.size(), 1);
+        y[(self.size() - 1, 0)] = 1.0;
+        y
+    }
+
+    /// Derivative of `y` by the body-frame rotation error.
+    fn derivative(self, rotation: &Rotation3<f64>) -> DMatrix<f64> {
+        let mut derivative = DMatrix::zeros(self.size(), 3);
+        match self {
+            Self::Group => derivative
+                .fixed_view_mut::<9, 3>(0, 0)
+                .copy_from(&rotated_vector_by_rotation(rotation.matrix())),
+            Self::Additive => derivative.fill_with_identity(),
+        }
+        derivative
+    }
+}
+
+/// `K` of a matrix Fisher density `F = M K` with the given information (minus the Hessian of its
+/// logarithm at the mode): `K = tr(H)/2 I - H`.
+fn concentration(information: &Matrix3<f64>) -> Matrix3<f64> {
+    Matrix3::identity() * (0.5 * information.trace()) - information
+}
+
+/// The 3x9 matrix `L` with `L vec(R) = (K M^T R - R^T M K)^vee`: the `v_R` of MFGB (W22 3.2) in
+/// body coordinates. It is zero at the mode `M` and grows there as `(tr(K) I - K) e`.
+fn tangent_coordinate(mode: &Matrix3<f64>, concentration: &Matrix3<f64>) -> SMatrix<f64, 3, 9> {
+    let left = concentration * mode.transpose();
+    let mut l = SMatrix::zeros();
+    for (component, (i, j)) in [(2, 1), (0, 2), (1, 0)].into_iter().enumerate() {
+        for k in 0..3 {
+            l[(component, 3 * j + k)] += left[(i, k)];
+            l[(component, 3 * i + k)] -= left[(j, k)];
+        }
+    }
+    l
+}

@@ -1,0 +1,811 @@
+//! Filters that keep map points in the state, with all correlations (`mfgs`, `mekfs`).
+
+use nalgebra::{DMatrix, Matrix3, UnitQuaternion, Vector3};
+
+use super::gravity::UnknownGravity;
+use super::regression::{Coordinates, Fit, Measurement, Posterior, Regression, Target};
+use super::{
+    FilterConfig, PointState, Screening, SeenPoint, UpdateOutcome, VisualInertialFilter,
+    point_by_pose,
+};
+use crate::alignment::{MapEstimate, PointPair};
+use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block};
+use crate::so3::{self, ProperSvd};
+
+/// Size of the navigation part of the state.
+const NAVIGATION: usize = 15;
+
+/// A map point of the state.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct StatePoint {
+    id: u64,
+    /// World coordinates, m.
+    position: Vector3<f64>,
+}
+
+/// Visual-inertial filter whose Euclidean state is `(v, p, b_g, b_a, l_1 ... l_M)`.
+///
+/// A point `l` of the state measured at `p'` in the body frame is `0 = R p' + p - l + noise`.
+/// Between updates the belief is the mode and the covariance of the error around it, as in
+/// [`Belief`], points in world coordinates; an update works on the regression of the Euclidean
+/// part on the rotation ([`Regression`]), in one of two [`Coordinates`].
+///
+/// With `n = 15 + 3 M` an update with `m` points costs `O(n^2 m)`, a propagation step `O(15^3)`:
+/// what it does to the correlations with the points is gathered and done at the next update.
+#[derive(Debug, Clone)]
+pub struct SlamFilter {
+    config: FilterConfig,
+    coordinates: Coordinates,
+    propagator: Propagator,
+    belief: Belief,
+    /// In the order of their rows.
+    points: Vec<StatePoint>,
+    /// Covariance of (navigation, points). Its navigation rows and columns date from the last
+    /// update; [`Self::synchronize`] brings them up to date.
+    covariance: DMatrix<f64>,
+    /// Derivative of the navigation error now by that at the last update.
+    transition: NavCovariance,
+    /// Gravity as part of the state, its block following the navigation part, until its direction
+    /// is known well enough for the world to be turned upright.
+    gravity: Option<UnknownGravity>,
+    /// Whether the heading is that of an arbitrary world: uniform, and independent of all else.
+    heading_is_free: bool,
+    /// For each point of the last update that it entered: the robust kernel weighs them all.
+    passed: Vec<bool>,
+    /// Turn of the world since it was last asked for.
+    world_turn: Option<UnitQuaternion<f64>>,
+}
+
+impl SlamFilter {
+    pub fn new(
+        config: &FilterConfig,
+        coordinates: Coordinates,
+        propagator: Propagator,
+        belief: Belief,
+    ) -> Self {
+        let covariance = DMatrix::from_fn(NAVIGATION, NAVIGATION, |i, j| belief.covariance[(i, j)]);
+        Self {
+            config: config.clone(),
+            coordinates,
+            propagator,
+            belief,
+            points: Vec::with_capacity(config.state_points),
+            covariance,
+            transition: NavCovariance::identity(),
+            gravity: None,
+            heading_is_free: false,
+            passed: Vec::new(),
+            world_turn: None,
+        }
+    }
+
+    /// The same, in a world whose heading is arbitrary: its distribution is uniform.
+    pub fn with_free_heading(mut self) -> Self {
+        self.heading_is_free = true;
+        self
+    }
+
+    /// The same, in the body's frame at the start, in which `belief` must be given: gravity of
+    /// the given magnitude (m/s^2) has any direction, so that the attitude in an upright world is
+    /// uniformly distributed.
+    pub fn with_unknown_gravity(mut self, magnitude: f64) -> Self {
+        let gravity = UnknownGravity::new(magnitude);
+        self.propagator.set_gravity(gravity.mean);
+        let mut covariance = DMatrix::zeros(NAVIGATION + 3, NAVIGATION + 3);
+        covariance.view_mut((0, 0), (NAVIGATION, NAVIGATION)).copy_from(&self.covariance);
+        covariance.fixed_view_mut::<3, 3>(NAVIGATION, NAVIGATION).copy_from(&gravity.covariance);
+        self.covariance = covariance;
+        self.gravity = Some(gravity);
+        self.with_free_heading()
+    }
+
+    /// First row of the points.
+    fn base(&self) -> usize {
+        NAVIGATION + if self.gravity.is_some() { 3 } else { 0 }
+    }
+
+    fn synchronize(&mut self) {
+        let n = self.covariance.ncols() - NAVIGATION;
+        let mut cross = self.transition * self.covariance.view((0, NAVIGATION), (NAVIGATION, n));
+        if let Some(gravity) = &mut self.gravity {
+            cross += gravity.transition * self.covariance.view((NAVIGATION, NAVIGATION), (3, n));
+            gravity.transition.fill(0.0);
+        }
+        self.covariance.view_mut((0, NAVIGATION), (NAVIGATION, n)).copy_from(&cross);
+        self.covariance.view_mut((NAVIGATION, 0), (n, NAVIGATION)).copy_from(&cross.transpose());
+        self.covariance
+            .view_mut((0, 0), (NAVIGATION, NAVIGATION))
+            .copy_from(&self.belief.covariance);
+        self.transition = NavCovariance::identity();
+    }
+
+    fn slot(&self, id: u64) -> Option<usize> {
+        self.points.iter().position(|point| point.id == id)
+    }
+
+    /// Mean of the Euclidean part in the order of the covariance's rows after the rotation.
+    fn euclidean(&self) -> Vec<Vector3<f64>> {
+        let state = &self.belief.state;
+        let mut blocks = vec![Vector3::zeros(); NAVIGATION / 3 - 1];
+        blocks[block::VELOCITY / 3 - 1] = state.velocity;
+        blocks[block::POSITION / 3 - 1] = state.world_from_body.translation.vector;
+        blocks[block::GYRO_BIAS / 3 - 1] = state.gyro_bias;
+        blocks[block::ACCEL_BIAS / 3 - 1] = state.accel_bias;
+        blocks.extend(self.gravity.as_ref().map(|gravity| gravity.mean));
+        blocks.extend(self.points.iter().map(|point| point.position));
+        blocks
+    }
+
+    fn condition(&mut self, measurements: &[Measurement]) -> Option<UpdateOutcome> {
+        if measurements.is_empty() {
+            return None;
+        }
+        self.synchronize();
+        let prior = self.belief.state.world_from_body.rotation.to_rotation_matrix();
+        let means = self.euclidean();
+        let mut weighted_at = prior;
+        let mut posterior: Option<(Posterior, Fit)> = None;
+        for _ in 0..=self.config.relinearizations {
+            let mut regression =
+                Regression::of_prior(self.coordinates, &prior, &means, &self.covariance)?;
+            let fit = regression.condition(measurements, &weighted_at, self.config.huber)?;
+            let found = regression.posterior()?;
+            let turned = so3::log(&weighted_at.rotation_to(&found.mode)).norm();
+            weighted_at = found.mode;
+            let fit = posterior.map_or(fit, |(_, first)| first);
+            posterior = Some((found, fit));
+            if turned < RELINEARIZE_ABOVE {
+                break;
+            }
+        }
+        let (posterior, fit) = posterior?;
+        self.accept(posterior)?;
+        self.settle_gravity();
+        let screening = Screening { largest: fit.largest, threshold: f64::INFINITY, rejected: 0 };
+        self.passed = vec![true; measurements.len()];
+        Some(UpdateOutcome { innovation: fit.innovation, points: measurements.len(), screening })
+    }
+
+    fn accept(&mut self, posterior: Posterior) -> Option<()> {
+        let Posterior { mode, means, covariance } = posterior;
+        let mean = |start: usize| means.get(start / 3 - 1).copied();
+        let mut belief = self.belief;
+        let state = &mut belief.state;
+        state.world_from_body.rotation = UnitQuaternion::from_rotation_matrix(&mode);
+        state.world_from_body.translation.vector = mean(block::POSITION)?;
+        state.velocity = mean(block::VELOCITY)?;
+        state.gyro_bias = mean(block::GYRO_BIAS)?;
+        state.accel_bias = mean(block::ACCEL_BIAS)?;
+        belief.covariance = covariance.fixed_view::<NAVIGATION, NAVIGATION>(0, 0).into_owned();
+        let finite = means.iter().flatten().chain(covariance.iter()).all(|x| x.is_finite());
+        if !(finite && belief.is_finite()) {
+            return None;
+        }
+        self.belief = belief;
+        let points = means.iter().skip(self.base() / 3 - 1);
+        for (point, position) in self.points.iter_mut().zip(points) {
+            point.position = *position;
+        }
+        if let (Some(gravity), Some(mean)) = (&mut self.gravity, means.get(NAVIGATION / 3 - 1)) {
+            gravity.mean = *mean;
+            gravity.follow(&covariance);
+            self.propagator.set_gravity(*mean);
+        }
+        self.covariance = covariance;
+        Some(())
+    }
+
+    /// Row of a point's block in the covariance.
+    fn row(&self, slot: usize) -> usize {
+        self.base() + 3 * slot
+    }
+}
+
+impl SlamFilter {
+    /// Turns the world so that the mean of gravity points down; once its direction is known well,
+    /// what is uncertain of it becomes uncertainty of the attitude, and gravity leaves the state.
+    fn settle_gravity(&mut self) {
+        let Some(turn) = self.gravity.as_ref().and_then(UnknownGravity::levelling_turn) else {
+            return;
+        };
+        self.turn_world(&turn);
+        if self.gravity.as_ref().is_some_and(UnknownGravity::is_settled) {
+            self.use_magnitude_of_gravity();
+            self.fix_gravity();
+        }
+    }
+
+    /// Turns everything in world coordinates; the covariance is up to date.
+    fn turn_world(&mut self, turn: &UnitQuaternion<f64>) {
+        let matrix = turn.to_rotation_matrix().into_inner();
+        let world_blocks = [block::VELOCITY, block::POSITION]
+            .into_iter()
+            .chain((NAVIGATION..self.covariance.ncols()).step_by(3));
+        for row in world_blocks {
+            let rows = matrix * self.covariance.rows(row, 3);
+            self.covariance.rows_mut(row, 3).copy_from(&rows);
+            let columns = self.covariance.columns(row, 3) * matrix.transpose();
+            self.covariance.columns_mut(row, 3).copy_from(&columns);
+        }
+        let state = &mut self.belief.state;
+        state.world_from_body = turn * state.world_from_body;
+        state.velocity = turn * state.velocity;
+        for point in &mut self.points {
+            point.position = turn * point.position;
+        }
+        if let Some(gravity) = &mut self.gravity {
+            gravity.mean = turn * gravity.mean;
+            gravity.follow(&self.covariance);
+            self.propagator.set_gravity(gravity.mean);
+        }
+        self.belief.covariance =
+            self.covariance.fixed_view::<NAVIGATION, NAVIGATION>(0, 0).into_owned();
+        self.world_turn = Some(turn * self.world_turn.unwrap_or_default());
+    }
+
+    /// Conditions the state on the magnitude of gravity, to first order.
+    fn use_magnitude_of_gravity(&mut self) {
+        let Some(gravity) = &self.gravity else { return };
+        let Some((error, direction)) = gravity.magnitude_error() else { return };
+        let by_magnitude = self.covariance.columns(NAVIGATION, 3) * direction;
+        let variance = direction.dot(&by_magnitude.fixed_rows::<3>(NAVIGATION))
+            + gravity.magnitude_sd().powi(2);
+        self.covariance.ger(-1.0 / variance, &by_magnitude, &by_magnitude, 1.0);
+        let change = by_magnitude * (error / variance);
+        let part = |start: usize| change.fixed_rows::<3>(start).into_owned();
+        let state = &mut self.belief.state;
+        let turned = state.world_from_body.rotation
+            * UnitQuaternion::from_scaled_axis(part(block::ROTATION));
+        state.world_from_body.rotation = UnitQuaternion::new_normalize(turned.into_inner());
+        state.world_from_body.translation.vector += part(block::POSITION);
+        state.velocity += part(block::VELOCITY);
+        state.gyro_bias += part(block::GYRO_BIAS);
+        state.accel_bias += part(block::ACCEL_BIAS);
+        for (slot, point) in self.points.iter_mut().enumerate() {
+            point.position += part(NAVIGATION + 3 + 3 * slot);
+        }
+    }
+
+    /// Gravity becomes `(0, 0, -g)`, and its error a turn of everything in the world.
+    fn fix_gravity(&mut self) {
+        let Some(gravity) = self.gravity.take() else { return };
+        let n = self.covariance.ncols();
+        let mut by_old = DMatrix::zeros(n - 3, n);
+        for k in 0..n - 3 {
+            by_old[(k, if k < NAVIGATION { k } else { k + 3 })] = 1.0;
+        }
+        let state = &self.belief.state;
+        let mut set = |row: usize, value: Matrix3<f64>| {
+            by_old.fixed_view_mut::<3, 3>(row, NAVIGATION).copy_from(&value);
+        };
+        let position = &state.world_from_body.translation.vector;
+        set(block::ROTATION, gravity.rotation_by_gravity(&state.world_from_body.rotation));
+        set(block::VELOCITY, gravity.vector_by_gravity(&state.velocity));
+        set(block::POSITION, gravity.vector_by_gravity(position));
+        for (slot, point) in self.points.iter().enumerate() {
+            set(NAVIGATION + 3 * slot, gravity.vector_by_gravity(&point.position));
+        }
+        self.covariance = &by_old * &self.covariance * by_old.transpose();
+        self.belief.covariance =
+            self.covariance.fixed_view::<NAVIGATION, NAVIGATION>(0, 0).into_owned();
+        self.propagator.set_gravity(gravity.upright());
+    }
+
+    /// Inverse of the mean variance of roll and pitch, 1/rad^2.
+    fn tilt_concentration(&self) -> f64 {
+        let rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
+        let covariance =
+            self.belief.covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION);
+        let in_world = rotation.matrix() * covariance * rotation.matrix().transpose();
+        2.0 / (in_world.m11 + in_world.m22)
+    }
+
+    /// The matrix Fisher parameter of rank one of a von Mises-Fisher distributed vertical and a
+    /// uniform heading: `kappa e_z (R^T e_z)^T`.
+    fn of_vertical(&self, kappa: f64) -> Option<ProperSvd> {
+        let rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
+        let up = Vector3::z() * Vector3::z().transpose() * rotation.matrix();
+        so3::proper_svd(&(up * kappa)).ok()
+    }
+}
+
+/// An attitude that moved further than this in an update has its measurements weighted anew at
+/// where it came to, rad.
+const RELINEARIZE_ABOVE: f64 = 0.02;
+
+impl VisualInertialFilter for SlamFilter {
+    fn belief(&self) -> &Belief {
+        &self.belief
+    }
+
+    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool {
+        let step = self.propagator.propagate_with_transition(&mut self.belief, from, to);
+        if let Some(step) = step {
+            self.transition = step * self.transition;
+            if let Some(gravity) = &mut self.gravity {
+                gravity.propagate(&mut self.belief, &step, to.stamp.seconds_since(from.stamp));
+            }
+        }
+        step.is_some()
+    }
+
+    fn coast(&mut self, seconds: f64) {
+        self.transition = self.propagator.coast(&mut self.belief, seconds) * self.transition;
+    }
+
+    fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome> {
+        let measurements: Vec<_> = pairs
+            .iter()
+            .map(|pair| Measurement {
+                in_body: pair.in_body,
+                body_covariance: pair.body_covariance,
+                target: Target::Known {
+                    position: pair.in_world,
+                    covariance: pair.world_covariance,
+                },
+            })
+            .collect();
+        self.condition(&measurements)
+    }
+
+    fn passed(&self) -> &[bool] {
+        &self.passed
+    }
+
+    fn matrix_fisher(&self) -> Option<ProperSvd> {
+        match (self.coordinates, &self.gravity) {
+            (Coordinates::Additive, _) => None,
+            (Coordinates::Group, Some(gravity)) => self.of_vertical(gravity.concentration()),
+            (Coordinates::Group, None) if self.heading_is_free => {
+                self.of_vertical(self.tilt_concentration())
+            }
+            (Coordinates::Group, None) => self.belief.attitude().map(|attitude| *attitude.svd()),
+        }
+    }
+
+    fn reported_covariance(&self) -> NavCovariance {
+        match &self.gravity {
+            Some(gravity) => gravity.upright_covariance(&self.belief),
+            None => self.belief.covariance,
+        }
+    }
+
+    fn take_world_turn(&mut self) -> Option<UnitQuaternion<f64>> {
+        self.world_turn.take()
+    }
+
+    fn point_state(&mut self) -> Option<&mut dyn PointState> {
+        Some(self)
+    }
+}
+
+impl PointState for SlamFilter {
+    fn free_slots(&self) -> usize {
+        self.config.state_points.saturating_sub(self.points.len())
+    }
+
+    fn ids(&self) -> Vec<u64> {
+        self.points.iter().map(|point| point.id).collect()
+    }
+
+    fn estimate(&self, id: u64) -> Option<MapEstimate> {
+        let slot = self.slot(id)?;
+        let row = self.row(slot);
+        Some(MapEstimate {
+            position: self.points[slot].position,
+            covariance: self.covariance.fixed_view::<3, 3>(row, row).into_owned(),
+        })
+    }
+
+    fn measure(&mut self, seen: &[SeenPoint]) -> Option<UpdateOutcome> {
+        let measurement = |point: &SeenPoint| {
+            Some(Measurement {
+                in_body: point.in_body,
+                body_covariance: point.body_covariance,
+                target: Target::State { block: self.base() / 3 - 1 + self.slot(point.id)? },
+            })
+        };
+        let measurements: Vec<_> = seen.iter().filter_map(measurement).collect();
+        self.condition(&measurements)
+    }
+
+    /// The point's error is exactly that of the pose, moved to the point, and that of the
+    /// measurement.
+    fn admit(&mut self, point: &SeenPoint) -> bool {
+        if self.free_slots() == 0 || self.slot(point.id).is_some() {
+            return false;
+        }
+        self.synchronize();
+        let pose = self.belief.state.world_from_body;
+        let rotation = pose.rotation.to_rotation_matrix();
+        let j = point_by_pose(rotation.matrix(), &point.in_body);
+        let (by_rotation, by_position) = (j.fixed_columns::<3>(0), j.fixed_columns::<3>(3));
+        let n = self.covariance.ncols();
+        let rows = by_rotation * self.covariance.fixed_rows::<3>(block::ROTATION)
+            + by_position * self.covariance.fixed_rows::<3>(block::POSITION);
+        let measured = rotation.matrix() * point.body_covariance * rotation.matrix().transpose();
+        let own: Matrix3<f64> = rows.fixed_view::<3, 3>(0, block::ROTATION)
+            * by_rotation.transpose()
+            + rows.fixed_view::<3, 3>(0, block::POSITION) * by_position.transpose()
+            + measured;
+        let position = rotation * point.in_body + pose.translation.vector;
+        let finite = position.iter().chain(rows.iter()).chain(own.iter()).all(|x| x.is_finite());
+        if !finite {
+            return false;
+        }
+        let mut covariance = DMatrix::zeros(n + 3, n + 3);
+        covariance.view_mut((0, 0), (n, n)).copy_from(&self.covariance);
+        covariance.view_mut((n, 0), (3, n)).copy_from(&rows);
+        covariance.view_mut((0, n), (n, 3)).copy_from(&rows.transpose());
+        covariance.view_mut((n, n), (3, 3)).copy_from(&((own + own.transpose()) * 0.5));
+        self.covariance = covariance;
+        self.points.push(StatePoint { id: point.id, position });
+        true
+    }
+
+    fn release(&mut self, id: u64) -> bool {
+        let Some(slot) = self.slot(id) else { return false };
+        let row = self.row(slot);
+        self.points.remove(slot);
+        let covariance = std::mem::take(&mut self.covariance);
+        self.covariance = covariance.remove_fixed_rows::<3>(row).remove_fixed_columns::<3>(row);
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::filter::FilterKind;
+    use crate::inertial::{ImuConfig, NavState, Stamp};
+    use approx::assert_relative_eq;
+    use nalgebra::Isometry3;
+    use proptest::prelude::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    fn vector(rng: &mut ChaCha8Rng, scale: f64) -> Vector3<f64> {
+        Vector3::from_fn(|_, _| rng.random_range(-scale..scale))
+    }
+
+    fn normal(rng: &mut ChaCha8Rng) -> Vector3<f64> {
+        Vector3::from_fn(|_, _| StandardNormal.sample(rng))
+    }
+
+    /// A belief with every correlation present and a rotation spread of about `spread` rad.
+    fn belief(rng: &mut ChaCha8Rng, spread: f64) -> Belief {
+        let root = NavCovariance::from_fn(|i, _| {
+            (if i < 3 { spread } else { 0.1 }) * rng.random_range(-0.5..0.5)
+        });
+        let mut covariance = root * root.transpose();
+        for k in 0..15 {
+            covariance[(k, k)] += if k < 3 { 0.1 * spread * spread } else { 0.01 };
+        }
+        let state = NavState {
+            world_from_body: Isometry3::new(vector(rng, 3.0), vector(rng, 1.5)),
+            velocity: vector(rng, 1.0),
+            gyro_bias: vector(rng, 0.1),
+            accel_bias: vector(rng, 0.1),
+        };
+        Belief { state, covariance }
+    }
+
+    fn filter(kind: FilterKind, belief: Belief) -> Box<dyn VisualInertialFilter> {
+        let config = FilterConfig { huber: 0.0, ..FilterConfig::default() };
+        kind.start(&config, Propagator::inertial(&ImuConfig::default()), belief)
+    }
+
+    fn seen(id: u64, in_body: Vector3<f64>, body_covariance: Matrix3<f64>) -> SeenPoint {
+        SeenPoint { id, in_body, body_covariance }
+    }
+
+    /// Admits 20 points and measures them 30 times from where they were first seen, with noise
+    /// of the given standard deviations along random axes of each measurement.
+    fn measure_without_moving(
+        filter: &mut dyn VisualInertialFilter,
+        deviations: &Vector3<f64>,
+        rng: &mut ChaCha8Rng,
+    ) {
+        let exact: Vec<_> = (0..20).map(|_| vector(rng, 3.0)).collect();
+        for round in 0..=30 {
+            let points: Vec<_> = exact
+                .iter()
+                .enumerate()
+                .map(|(id, in_body)| {
+                    let axes = UnitQuaternion::new(vector(rng, 2.0)).to_rotation_matrix();
+                    let noise = axes * normal(rng).component_mul(deviations);
+                    let variances = deviations.component_mul(deviations);
+                    let covariance = axes.matrix()
+                        * Matrix3::from_diagonal(&variances)
+                        * axes.matrix().transpose();
+                    seen(id as u64, in_body + noise, covariance)
+                })
+                .collect();
+            let state = filter.point_state().unwrap();
+            if round == 0 {
+                assert!(points.iter().all(|point| state.admit(point)));
+            } else {
+                assert!(state.measure(&points).is_some());
+            }
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(8))]
+
+        /// What turns and moves body and map together cannot be observed, so that the attitude
+        /// and the position keep their covariance, whatever the spread and the noise.
+        #[test]
+        fn measuring_again_without_motion_tells_nothing_of_the_pose(
+            seed: u64, spread in 0.01..0.3f64, anisotropy in 1.0..10.0f64,
+        ) {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let prior = belief(&mut rng, spread);
+            let mut mfgs = filter(FilterKind::Mfgs, prior);
+            let deviations = Vector3::new(0.02, 0.02, 0.02 * anisotropy);
+            measure_without_moving(mfgs.as_mut(), &deviations, &mut rng);
+            let (before, after) = (prior.covariance, mfgs.belief().covariance);
+            let change = (after - before).norm() / before.norm();
+            prop_assert!(change < 1e-9, "{change}");
+            let turned = mfgs.belief().state.world_from_body.rotation;
+            let turned = turned.angle_to(&prior.state.world_from_body.rotation);
+            prop_assert!(turned < 1e-7, "{turned}");
+        }
+    }
+
+    /// The rival's linearisation follows its estimates of the points and so finds information
+    /// where there is none.
+    #[test]
+    fn the_kalman_filter_believes_that_it_learns_by_measuring_again() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let prior = belief(&mut rng, 0.2);
+        let mut mekfs = filter(FilterKind::Mekfs, prior);
+        measure_without_moving(mekfs.as_mut(), &Vector3::repeat(0.05), &mut rng);
+        let trace = |b: &Belief| b.covariance.fixed_view::<3, 3>(0, 0).trace();
+        assert!(trace(mekfs.belief()) < 0.9 * trace(&prior));
+    }
+
+    /// Both filters are the Kalman filter of the linearised system where everything is small.
+    #[test]
+    fn both_filters_agree_with_a_dense_kalman_filter_in_the_limit() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut prior = belief(&mut rng, 1e-3);
+        prior.covariance *= 1e-4;
+        prior.state.velocity = Vector3::zeros();
+        let at_rest = |nanos| ImuSample {
+            stamp: Stamp::from_nanos(nanos),
+            angular_velocity: prior.state.gyro_bias,
+            specific_force: prior.state.accel_bias
+                + prior.state.world_from_body.rotation.inverse()
+                    * Vector3::new(0.0, 0.0, ImuConfig::default().gravity),
+        };
+        let noise = Matrix3::from_diagonal(&Vector3::new(1e-6, 2e-6, 5e-6));
+        let exact: Vec<_> = (0..7).map(|_| vector(&mut rng, 3.0)).collect();
+        let again: Vec<_> = exact.iter().map(|p| p + vector(&mut rng, 1e-3)).collect();
+        let mut results = Vec::new();
+        for kind in [FilterKind::Mfgs, FilterKind::Mekfs] {
+            let mut filter = filter(kind, prior);
+            let points = filter.point_state().unwrap();
+            for (id, in_body) in exact.iter().enumerate() {
+                assert!(points.admit(&seen(id as u64, *in_body, noise)));
+            }
+            assert!(filter.propagate(&at_rest(0), &at_rest(20_000_000)));
+            let again: Vec<_> =
+                again.iter().enumerate().map(|(id, p)| seen(id as u64, *p, noise)).collect();
+            let points = filter.point_state().unwrap();
+            assert!(points.measure(&again).is_some());
+            let positions: Vec<_> = (0..7).map(|id| points.estimate(id).unwrap()).collect();
+            results.push((*filter.belief(), positions));
+        }
+
+        let mut moved = prior;
+        let step = Propagator::inertial(&ImuConfig::default())
+            .propagate_with_transition(&mut moved, &at_rest(0), &at_rest(20_000_000))
+            .unwrap();
+        let rotation = prior.state.world_from_body.rotation.to_rotation_matrix();
+        let n = 15 + 21;
+        let mut by_start = DMatrix::zeros(n, n);
+        by_start.view_mut((0, 0), (15, 15)).fill_with_identity();
+        let mut start = DMatrix::zeros(n, n);
+        start.view_mut((0, 0), (15, 15)).copy_from(&prior.covariance);
+        let world_noise = rotation.matrix() * noise * rotation.matrix().transpose();
+        let mut h = DMatrix::zeros(21, n);
+        let mut noises = DMatrix::zeros(21, 21);
+        let mut residual = DMatrix::zeros(21, 1);
+        for i in 0..7 {
+            let (row, at) = (3 * i, 15 + 3 * i);
+            let j = point_by_pose(rotation.matrix(), &exact[i]);
+            for (from, to) in [(0, block::ROTATION), (3, block::POSITION)] {
+                let part = j.fixed_columns::<3>(from);
+                by_start.fixed_view_mut::<3, 3>(at, to).copy_from(&part);
+                h.fixed_view_mut::<3, 3>(row, to).copy_from(&part);
+            }
+            by_start.fixed_view_mut::<3, 3>(at, at).fill_with_identity();
+            start.fixed_view_mut::<3, 3>(at, at).copy_from(&world_noise);
+            h.fixed_view_mut::<3, 3>(row, at).copy_from(&-Matrix3::identity());
+            noises.fixed_view_mut::<3, 3>(row, row).copy_from(&world_noise);
+            residual.fixed_view_mut::<3, 1>(row, 0).copy_from(&(rotation * (exact[i] - again[i])));
+        }
+        let mut prior_covariance = &by_start * start * by_start.transpose();
+        let cross = step * prior_covariance.view((0, 15), (15, 21));
+        prior_covariance.view_mut((0, 15), (15, 21)).copy_from(&cross);
+        prior_covariance.view_mut((15, 0), (21, 15)).copy_from(&cross.transpose());
+        prior_covariance.view_mut((0, 0), (15, 15)).copy_from(&moved.covariance);
+        let innovation = &h * &prior_covariance * h.transpose() + noises;
+        let gain = &prior_covariance * h.transpose() * innovation.try_inverse().unwrap();
+        let posterior = &prior_covariance - &gain * &h * &prior_covariance;
+        let change = gain * residual;
+        for (belief, points) in &results {
+            let expected = posterior.fixed_view::<15, 15>(0, 0);
+            assert!((belief.covariance - expected).norm() < 1e-4 * expected.norm());
+            let expected = change.fixed_view::<3, 1>(block::VELOCITY, 0);
+            let error = (belief.state.velocity - expected).norm();
+            assert!(error < 1e-2 * expected.norm(), "{error} {expected}");
+            for (i, point) in points.iter().enumerate() {
+                let start = rotation * exact[i] + prior.state.world_from_body.translation.vector;
+                let expected = start + change.fixed_view::<3, 1>(15 + 3 * i, 0);
+                assert!((point.position - expected).norm() < 1e-5);
+                let expected = posterior.fixed_view::<3, 3>(15 + 3 * i, 15 + 3 * i);
+                assert!((point.covariance - expected).norm() < 1e-3 * expected.norm());
+            }
+        }
+    }
+
+    #[test]
+    fn releasing_a_point_leaves_the_rest_as_it_was() {
+        let mut rng = ChaCha8Rng::seed_from_u64(9);
+        let prior = belief(&mut rng, 0.1);
+        let mut mfgs = filter(FilterKind::Mfgs, prior);
+        measure_without_moving(mfgs.as_mut(), &Vector3::repeat(0.1), &mut rng);
+        let before = *mfgs.belief();
+        let points = mfgs.point_state().unwrap();
+        let kept: Vec<_> = (0..20).filter(|id| *id != 7).map(|id| points.estimate(id)).collect();
+        assert!(points.release(7) && !points.release(7));
+        let after: Vec<_> = (0..20).filter(|id| *id != 7).map(|id| points.estimate(id)).collect();
+        assert_eq!(kept, after);
+        assert_eq!(points.estimate(7), None);
+        assert_eq!(points.ids().len(), 19);
+        assert_eq!(*mfgs.belief(), before);
+    }
+
+    /// The correlation of points with the pose is carried by the product of the steps.
+    #[test]
+    fn correlations_follow_the_motion() {
+        let mut rng = ChaCha8Rng::seed_from_u64(11);
+        let prior = belief(&mut rng, 0.05);
+        let mut mfgs = filter(FilterKind::Mfgs, prior);
+        let point = seen(0, vector(&mut rng, 2.0), Matrix3::identity() * 1e-4);
+        assert!(mfgs.point_state().unwrap().admit(&point));
+        let position = |f: &dyn VisualInertialFilter| f.belief().covariance;
+        let before = position(mfgs.as_ref());
+        let sample = |nanos| ImuSample {
+            stamp: Stamp::from_nanos(nanos),
+            angular_velocity: Vector3::new(0.3, -0.5, 0.2),
+            specific_force: Vector3::new(0.5, 0.1, 9.8),
+        };
+        for k in 0..20 {
+            assert!(mfgs.propagate(&sample(k * 5_000_000), &sample((k + 1) * 5_000_000)));
+        }
+        assert!((position(mfgs.as_ref()) - before).norm() > 1e-3);
+        // Measured very precisely, the point fixes the body relative to it: the spread of the
+        // position that is left is that of the point and of the lever to it.
+        let point = mfgs.point_state().unwrap().estimate(0).unwrap().position;
+        let exact = mfgs.belief().state.world_from_body.inverse_transform_point(&point.into());
+        let again = seen(0, exact.coords, Matrix3::identity() * 1e-10);
+        assert!(mfgs.point_state().unwrap().measure(&[again]).is_some());
+        let belief = mfgs.belief();
+        let rotation = belief.state.world_from_body.rotation.to_rotation_matrix();
+        let j = point_by_pose(rotation.matrix(), &exact.coords);
+        let seen_spread = j * super::super::pose_covariance(&belief.covariance) * j.transpose();
+        let spread = mfgs.point_state().unwrap().estimate(0).unwrap().covariance;
+        assert!((seen_spread - spread).norm() < 1e-3 * spread.norm());
+    }
+
+    #[test]
+    fn nothing_that_is_not_finite_enters() {
+        let mut rng = ChaCha8Rng::seed_from_u64(13);
+        let prior = belief(&mut rng, 0.05);
+        for kind in [FilterKind::Mfgs, FilterKind::Mekfs] {
+            let mut filter = filter(kind, prior);
+            let points = filter.point_state().unwrap();
+            let good = seen(0, Vector3::x(), Matrix3::identity());
+            for bad in [f64::NAN, f64::INFINITY] {
+                assert!(!points.admit(&seen(1, Vector3::repeat(bad), Matrix3::identity())));
+                assert!(!points.admit(&seen(1, Vector3::x(), Matrix3::repeat(bad))));
+            }
+            assert!(points.admit(&good) && !points.admit(&good));
+            for bad in [f64::NAN, f64::INFINITY, 1e300] {
+                let _ = points.measure(&[seen(0, Vector3::repeat(bad), Matrix3::identity())]);
+                let _ = points.measure(&[seen(0, Vector3::x(), Matrix3::repeat(bad))]);
+            }
+            assert!(points.measure(&[]).is_none());
+            assert!(filter.belief().is_finite());
+        }
+    }
+
+    /// A body that moves among points with its attitude unknown: gravity makes roll and pitch
+    /// converge to what they are, and `S` grows from zero.
+    #[test]
+    fn gravity_is_found_from_any_attitude() {
+        let mut rng = ChaCha8Rng::seed_from_u64(17);
+        for _ in 0..4 {
+            let world_from_start = UnitQuaternion::new(vector(&mut rng, 3.0));
+            let rate = Vector3::new(0.4, -0.3, 0.6);
+            let acceleration = |t: f64| {
+                Vector3::new(1.5 * (4.0 * t).cos(), 2.0 * (5.0 * t).sin(), (3.0 * t).cos())
+            };
+            let body = |t: f64| world_from_start * UnitQuaternion::new(rate * t);
+            let place = |t: f64| {
+                Vector3::new(
+                    -1.5 / 16.0 * (4.0 * t).cos(),
+                    -2.0 / 25.0 * (5.0 * t).sin(),
+                    -(3.0 * t).cos() / 9.0,
+                )
+            };
+            let gravity = ImuConfig::default().gravity;
+            let sample = |t: f64| ImuSample {
+                stamp: Stamp::default().offset_by(t),
+                angular_velocity: rate,
+                specific_force: body(t).inverse() * (acceleration(t) + Vector3::z() * gravity),
+            };
+            let mut covariance = NavCovariance::identity() * 1e-4;
+            covariance.fixed_view_mut::<3, 3>(block::VELOCITY, block::VELOCITY).fill_diagonal(1.0);
+            let state = NavState {
+                world_from_body: Isometry3::identity(),
+                velocity: Vector3::zeros(),
+                gyro_bias: Vector3::zeros(),
+                accel_bias: Vector3::zeros(),
+            };
+            let known = super::super::KnownAttitude::Nothing { gravity };
+            let mut filter = FilterKind::Mfgs.start_knowing(
+                known,
+                &FilterConfig::default(),
+                Propagator::inertial(&ImuConfig::default()),
+                Belief { state, covariance },
+            );
+            assert_eq!(filter.matrix_fisher().map(|f| f.s), Some(Vector3::zeros()));
+            let landmarks: Vec<_> = (0..15).map(|_| vector(&mut rng, 3.0)).collect();
+            let measure = |t: f64, rng: &mut ChaCha8Rng| -> Vec<SeenPoint> {
+                let exact = |l: &Vector3<f64>| body(t).inverse() * (l - place(t));
+                let noise = Matrix3::identity() * 0.005f64.powi(2);
+                let see = |(id, l)| seen(id as u64, exact(l) + normal(rng) * 0.005, noise);
+                landmarks.iter().enumerate().map(see).collect()
+            };
+            for point in measure(0.0, &mut rng) {
+                assert!(filter.point_state().unwrap().admit(&point));
+            }
+            let mut kappa = 0.0;
+            for frame in 0..30 {
+                let t = |step: usize| (frame * 10 + step) as f64 * 0.005;
+                for step in 0..10 {
+                    assert!(filter.propagate(&sample(t(step)), &sample(t(step + 1))));
+                }
+                let points = measure(t(10), &mut rng);
+                assert!(filter.point_state().unwrap().measure(&points).is_some());
+                if frame == 3 {
+                    kappa = filter.matrix_fisher().unwrap().s.x;
+                }
+            }
+            let state = &filter.belief().state;
+            let up = state.world_from_body.rotation.inverse() * Vector3::z();
+            let true_up = body(1.5).inverse() * Vector3::z();
+            let tilt = up.angle(&true_up);
+            let s = filter.matrix_fisher().unwrap().s;
+            assert!(tilt < 0.01, "{tilt}");
+            assert!(s.x > 10.0 * kappa && kappa > 0.0 && s.y.abs() < 1e-9 * s.x, "{s} {kappa}");
+            assert!(tilt < 5.0 / s.x.sqrt());
+            let speed = (body(1.5).inverse() * velocity(1.5)).norm();
+            assert_relative_eq!(state.velocity.norm(), speed, epsilon = 0.05);
+        }
+    }
+
+    /// Derivative of the motion of `gravity_is_found_from_any_attitude`.
+    fn velocity(t: f64) -> Vector3<f64> {
+        Vector3::new(
+            1.5 / 4.0 * (4.0 * t).sin(),
+            -2.0 / 5.0 * (5.0 * t).cos(),
+            (3.0 * t).sin() / 3.0,
+        )
+    }
+}
