@@ -518,8 +518,9 @@ impl Running {
         };
         let turn = self.filter.take_world_turn();
         if treatment != MapTreatment::Fixed && turn.is_none() {
-            let entered = pairs.iter().zip(self.filter.passed()).filter(|(_, passed)| **passed);
-            for ((id, pair), _) in entered {
+            // Points that were not offered, being none of the state, pass.
+            let passed = self.filter.passed().iter().chain(std::iter::repeat(&true));
+            for ((id, pair), _) in pairs.iter().zip(passed).filter(|(_, passed)| **passed) {
                 if let Some(refined) = self.filter.refine(pair) {
                     self.map.relocate(*id, refined.position, refined.covariance);
                 }
