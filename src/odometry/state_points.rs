@@ -39,7 +39,7 @@ pub fn renew_state_points(
             .filter(|point| points.estimate(point.id).is_some())
             .map(candidate)
             .collect();
-        let candidates: Vec<_> = group.iter().map(|point| candidate(point)).collect();
+        let candidates: Vec<_> = group.iter().map(candidate).collect();
         for index in choose_points(&in_use, &candidates, points.free_slots()) {
             if points.admit(&group[index]) {
                 map.hold(group[index].id, true);
