@@ -137,7 +137,7 @@ fn an_unknown_heading_is_found_and_kept_through_an_outage() {
 
 #[test]
 fn a_wrong_fix_is_rejected_and_a_lasting_jump_accepted() {
-    let drive = drive(60);
+    let drive = drive(90);
     let mut fixes = lines(&drive.gps);
     let shifted = |line: &str, by: f64| {
         let mut fields: Vec<String> = line.split(',').map(str::to_owned).collect();
@@ -149,13 +149,22 @@ fn a_wrong_fix_is_rejected_and_a_lasting_jump_accepted() {
         *line = shifted(line, 20.0);
     }
     std::fs::write(&drive.gps, fixes.join("\n")).unwrap();
+    let out = tempfile::tempdir().unwrap();
     let mut more = SETTINGS.to_vec();
     more.extend(["--set", "receiver.gate_probability=0.9999", "--set", "receiver.max_rejected=3"]);
-    more.push("--json");
+    more.extend(["--json", "--out", text(out.path())]);
     let report = json(&arguments(&drive.imu, &drive.gps, "mfgi", &more));
-    // One outlier, and three before the jump is believed.
-    assert_eq!(report["fixes_rejected"], 4);
-    assert_eq!(report["fixes_used"], 56);
+    // The line of each fix; the first one has none to be compared with.
+    let fates: Vec<String> =
+        columns(&out.path().join("state.csv"), &["fix"]).into_iter().flatten().collect();
+    let rejected = fates.iter().filter(|fate| *fate == "rejected").count();
+    assert_eq!(report["fixes_rejected"], rejected);
+    assert_eq!(fates.len(), 90);
+    let before = fates[1..49].iter().enumerate().filter(|(_, fate)| *fate == "rejected");
+    assert_eq!(before.map(|(k, _)| k + 1).collect::<Vec<_>>(), [39]);
+    assert!(fates[49..52].iter().all(|fate| fate == "rejected"), "{fates:?}");
+    assert_eq!(fates[52], "used");
+    assert!(fates[80..].iter().all(|fate| fate == "used"), "{fates:?}");
 }
 
 #[test]
