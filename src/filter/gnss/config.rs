@@ -31,8 +31,8 @@ pub struct ReceiverConfig {
     /// A fix is rejected if its normalized innovation squared exceeds the chi-square bound of this
     /// probability (3 degrees of freedom); 1 accepts every fix.
     pub gate_probability: f64,
-    /// After so many rejections in a row fixes are accepted again, whatever their innovations, until
-    /// one passes the gate.
+    /// After so many rejections in a row the position is taken to have jumped: it is given up, and
+    /// found again from the next fix, the rest of the state being kept.
     pub max_rejected: usize,
 }
 

@@ -162,6 +162,12 @@ impl GnssFilter for MekfGnss {
         Linear::of_position(&self.belief.state, position).innovation(&self.belief.covariance)
     }
 
+    fn loosen_position(&mut self, variance: f64) {
+        for k in block::POSITION..block::POSITION + 3 {
+            self.belief.covariance[(k, k)] += variance;
+        }
+    }
+
     fn belief(&self) -> Belief {
         self.belief
     }

@@ -1,6 +1,6 @@
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-use super::belief::NavigationBelief;
+use super::belief::{NavigationBelief, POSITION};
 use super::propagation::MomentPropagator;
 use super::update::{innovation, update_attitude, update_position};
 use super::{AttitudeUpdate, GnssFilter, InitialBelief, Innovation, Regression};
@@ -91,6 +91,12 @@ impl BayesFilter for MfgGnss {
 impl GnssFilter for MfgGnss {
     fn innovation(&self, position: &PositionMeasurement) -> Result<Innovation, FilterError> {
         innovation(&self.belief, position)
+    }
+
+    fn loosen_position(&mut self, variance: f64) {
+        for k in POSITION..POSITION + 3 {
+            self.belief.conditional[(k, k)] += variance;
+        }
     }
 
     fn belief(&self) -> Belief {

@@ -111,6 +111,9 @@ pub trait GnssFilter: BayesFilter {
     /// Difference of a position from its prediction, without using it.
     fn innovation(&self, position: &PositionMeasurement) -> Result<Innovation, FilterError>;
 
+    /// Adds an independent error of this variance (m^2) to each component of the position.
+    fn loosen_position(&mut self, variance: f64);
+
     /// The estimate, and the joint covariance of its error.
     fn belief(&self) -> Belief;
 

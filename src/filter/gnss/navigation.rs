@@ -224,8 +224,6 @@ struct Run<'a> {
     filter: Box<dyn GnssFilter>,
     gate: f64,
     rejected_in_a_row: usize,
-    /// From a fix that was used although it is outside the gate to the first one inside.
-    reacquiring: bool,
     last_output: Stamp,
     outages: OutageErrors,
     summary: NavigationSummary,
@@ -251,7 +249,6 @@ impl<'a> Run<'a> {
             filter,
             gate: config.receiver.gate(),
             rejected_in_a_row: 0,
-            reacquiring: false,
             last_output: fix.stamp,
             outages: OutageErrors::default(),
             summary: NavigationSummary { start: fix.stamp, used: 1, ..Default::default() },
@@ -292,23 +289,24 @@ impl<'a> Run<'a> {
         let fate = if let Some(number) = self.config.outage.index_at(elapsed) {
             self.outages.add(number, elapsed, innovation.residual.norm());
             FixUse::Outage(number)
-        } else if innovation.nis > self.gate && self.may_reject() {
+        } else if innovation.nis > self.gate
+            && self.rejected_in_a_row < self.config.receiver.max_rejected
+        {
             self.rejected_in_a_row += 1;
             self.summary.rejected += 1;
             FixUse::Rejected
         } else {
+            if innovation.nis > self.gate {
+                // The position has jumped, not the rest of the state.
+                self.filter.loosen_position(innovation.residual.norm_squared());
+            }
             self.filter.update_position(&position).map_err(at)?;
             self.rejected_in_a_row = 0;
-            self.reacquiring = innovation.nis > self.gate;
             self.summary.used += 1;
             self.summary.nis.push((elapsed, innovation.nis));
             FixUse::Used
         };
         Ok(self.step(fix.stamp, Some(FixReport { fate, innovation })))
-    }
-
-    fn may_reject(&self) -> bool {
-        !self.reacquiring && self.rejected_in_a_row < self.config.receiver.max_rejected
     }
 
     /// The belief, if the last one is old enough.
