@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::dataset::LogConfig;
+use crate::dataset::{LogConfig, LogSummary};
 use crate::filter::FilterConfig;
 use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
@@ -38,10 +38,11 @@ pub struct Config {
 }
 
 /// The configurations that come with the program, by the name a log's layout asks for.
-const SHIPPED: [(&str, &str); 4] = [
+const SHIPPED: [(&str, &str); 5] = [
     ("vcu_rvi", include_str!("../configs/vcu_rvi.toml")),
     ("tum_rgbd", include_str!("../configs/tum_rgbd.toml")),
     ("seven_scenes", include_str!("../configs/seven_scenes.toml")),
+    ("euroc", include_str!("../configs/euroc.toml")),
     ("sim", include_str!("../configs/sim.toml")),
 ];
 
@@ -80,6 +81,18 @@ impl Config {
             .find(|(shipped, _)| *shipped == name)
             .ok_or_else(|| ConfigError::NotShipped { name: name.to_owned() })?;
         parse(text, &format!("configs/{name}.toml"), overrides)
+    }
+
+    /// The configuration that fits a log: the shipped one for its layout, with the camera's
+    /// calibration where the log tells it, and `overrides`.
+    pub fn for_log(log: &LogSummary, overrides: &[String]) -> Result<Self, ConfigError> {
+        let shipped = Self::shipped(&log.config_name, &[])?;
+        let camera = log.camera.clone().unwrap_or_else(|| shipped.camera.clone());
+        let origin = format!("configs/{}.toml", log.config_name);
+        let text = toml::to_string(&Self { camera, ..shipped }).map_err(|error| {
+            ConfigError::Syntax { origin: origin.clone(), message: error.to_string() }
+        })?;
+        Self::parse(&text, &origin, overrides)
     }
 
     /// Reads `path` and applies `overrides` (`section.key=value`).

@@ -1,11 +1,13 @@
 //! The commands: one file each, each a thin shell over the library.
 
 mod attitude;
+mod convert;
 #[cfg(feature = "vision")]
 mod demo;
 mod evaluate;
 mod experiment;
 mod gnss;
+mod info;
 #[cfg(feature = "vision")]
 mod replay;
 mod simulate;
@@ -35,6 +37,8 @@ enum Command {
     Replay(replay::Args),
     Simulate(simulate::SimulateArgs),
     Attitude(attitude::AttitudeArgs),
+    Convert(convert::Args),
+    Info(info::Args),
     Evaluate(evaluate::EvaluateArgs),
     Experiment(experiment::ExperimentArgs),
     Gnss(gnss::GnssArgs),
@@ -51,6 +55,8 @@ pub fn main() -> ExitCode {
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(args),
         Command::Attitude(args) => attitude::run(&args),
+        Command::Convert(args) => convert::run(&args),
+        Command::Info(args) => info::run(&args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Experiment(args) => experiment::run(&args),
         Command::Gnss(args) => gnss::run(&args),

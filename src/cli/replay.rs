@@ -134,7 +134,7 @@ fn load_config(args: &Args, summary: &LogSummary) -> anyhow::Result<(Config, Str
         None => {
             let name = &summary.config_name;
             tracing::info!("{}: using the shipped configuration `{name}`", summary.kind);
-            Ok((Config::shipped(name, overrides)?, name.clone()))
+            Ok((Config::for_log(summary, overrides)?, name.clone()))
         }
     }
 }

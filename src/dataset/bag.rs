@@ -1,16 +1,16 @@
-//! ROS 1 bags, read record by record from the start; an index only tells the topics beforehand.
-//!
-//! Format: <http://wiki.ros.org/Bags/Format/2.0>.
+//! ROS 1 bags. Format: <http://wiki.ros.org/Bags/Format/2.0>.
 
 use std::collections::BTreeMap;
-use std::io::{self, BufRead, BufReader};
+use std::io::{self, BufRead, Read};
 
-use super::ReadReport;
 use super::message::{MessageType, Serialization};
-use super::ros::{Channel, MessageSource, Visitor};
-use super::section::{Chunk, LogFile, Section, fill, invalid, read_array, skip};
+use super::records::{ChunkHead, Format, MessageHead, RecordHead, RecordKind, Records};
+use super::ros::Channel;
+use super::section::{LogFile, fill, invalid, read_array};
+use crate::inertial::Stamp;
 
-pub(super) const MAGIC: &[u8] = b"#ROSBAG V2.0\n";
+/// The messages of a bag.
+pub(super) type Bag = Records<BagFormat>;
 
 /// A record header larger than this is taken for damage, bytes.
 const LARGEST_HEADER: u32 = 1 << 20;
@@ -23,219 +23,96 @@ mod op {
     pub const CONNECTION: u8 = 0x07;
 }
 
-/// The messages of a bag.
-pub(super) struct Bag {
-    file: LogFile,
-    records: BufReader<Section>,
-    /// Where `records` is in the file.
-    position: u64,
-    chunk: Option<Chunk>,
+#[derive(Default)]
+pub(super) struct BagFormat {
     connections: BTreeMap<u32, Channel>,
-    is_indexed: bool,
-    only: Option<Vec<String>>,
+    /// Fields of the record read last.
     header: Vec<u8>,
-    data: Vec<u8>,
 }
 
-impl Bag {
-    /// `file` must begin with [`MAGIC`].
-    pub fn new(file: LogFile) -> Self {
-        let start = MAGIC.len() as u64;
-        let mut bag = Self {
-            records: file.records(start),
-            position: start,
-            file,
-            chunk: None,
-            connections: BTreeMap::new(),
-            is_indexed: false,
-            only: None,
-            header: Vec::new(),
-            data: Vec::new(),
+impl Format for BagFormat {
+    const MAGIC: &'static [u8] = b"#ROSBAG V2.0\n";
+    const CUT: &'static str = "bag: cut short";
+    const DAMAGED: &'static str = "bag: chunk damaged or cut short";
+    const UNKNOWN_CHANNEL: &'static str = "bag: message of an unknown connection";
+    const HAS_END: bool = false;
+
+    fn read_head(&mut self, reader: &mut impl BufRead) -> io::Result<Option<RecordHead>> {
+        if reader.fill_buf()?.is_empty() {
+            return Ok(None);
+        }
+        let size = u32::from_le_bytes(read_array(reader)?);
+        if size > LARGEST_HEADER {
+            return Err(invalid(format!("a record header of {size} bytes")));
+        }
+        fill(reader, size.into(), &mut self.header)?;
+        let length = u32::from_le_bytes(read_array(reader)?);
+        let kind = match number(&self.header, b"op") {
+            Some([op::CHUNK]) => RecordKind::Chunk,
+            Some([op::MESSAGE]) => RecordKind::Message,
+            Some([op::CONNECTION]) => RecordKind::Declaration,
+            _ => RecordKind::Other,
         };
-        bag.is_indexed = bag.read_index().unwrap_or(false) && !bag.connections.is_empty();
-        bag
+        Ok(Some(RecordHead { kind, size: 8 + u64::from(size), length: length.into() }))
     }
 
-    /// Reads the connections listed at the end; `false` if the bag was not closed properly.
-    fn read_index(&mut self) -> io::Result<bool> {
-        let mut records = self.file.records(self.position);
-        read_head(&mut records, &mut self.header)?;
+    fn read_chunk_head(&mut self, _reader: &mut impl Read, length: u64) -> io::Result<ChunkHead> {
+        let compression = field(&self.header, b"compression").unwrap_or(b"none");
+        let compression = String::from_utf8_lossy(compression).into_owned();
+        Ok(ChunkHead { size: 0, length, compression, checksum: None })
+    }
+
+    fn read_message_head(&mut self, _reader: &mut impl Read) -> io::Result<MessageHead> {
+        let [seconds, nanos] = match number::<8>(&self.header, b"time") {
+            Some([a, b, c, d, e, f, g, h]) => [[a, b, c, d], [e, f, g, h]],
+            None => return Err(invalid("a message without a time".to_owned())),
+        }
+        .map(|part| i64::from(u32::from_le_bytes(part)));
+        let channel = number(&self.header, b"conn").map(u32::from_le_bytes);
+        Ok(MessageHead { channel, log_time: Stamp::from_parts(seconds, nanos), size: 0 })
+    }
+
+    fn declare(&mut self, body: &[u8]) -> io::Result<()> {
+        let id = number(&self.header, b"conn").map(u32::from_le_bytes);
+        let text = |value: &[u8]| String::from_utf8_lossy(value).into_owned();
+        if let (Some(id), Some(topic), Some(schema)) =
+            (id, field(&self.header, b"topic"), field(body, b"type"))
+        {
+            self.connections.entry(id).or_insert_with(|| Channel {
+                topic: text(topic),
+                schema: text(schema),
+                definition: field(body, b"message_definition").map(text).unwrap_or_default(),
+                kind: MessageType::from_name(&text(schema)),
+                serialization: Some(Serialization::Ros1),
+                metadata: BTreeMap::new(),
+            });
+        }
+        Ok(())
+    }
+
+    fn read_index(&mut self, file: &LogFile) -> io::Result<bool> {
+        let start = Self::MAGIC.len() as u64;
+        self.read_head(&mut file.records(start))?;
         let header = (number(&self.header, b"op"), number(&self.header, b"index_pos"));
         let (Some([op::BAG]), Some(position)) = header else { return Ok(false) };
         let position = u64::from_le_bytes(position);
-        if position <= self.position || position >= self.file.size() {
+        if position <= start || position >= file.size() {
             return Ok(false);
         }
-        let mut records = self.file.records(position);
-        while let Some(length) = read_head(&mut records, &mut self.header)? {
-            if number(&self.header, b"op") != Some([op::CONNECTION]) {
-                break;
-            }
-            fill(&mut records, length.into(), &mut self.data)?;
-            add_connection(&mut self.connections, &self.header, &self.data);
+        let mut records = file.records(position);
+        let mut body = Vec::new();
+        while let Some(RecordHead { kind: RecordKind::Declaration, length, .. }) =
+            self.read_head(&mut records)?
+        {
+            fill(&mut records, length, &mut body)?;
+            self.declare(&body)?;
         }
         Ok(true)
     }
 
-    /// Reads the next record outside chunks; `None` at the end.
-    fn read_outer(
-        &mut self,
-        report: &mut ReadReport,
-        visitor: &mut Visitor,
-    ) -> io::Result<Option<Outcome>> {
-        let start = self.position;
-        let Some(length) = read_head(&mut self.records, &mut self.header)? else {
-            return Ok(None);
-        };
-        let data_start = start + 8 + self.header.len() as u64;
-        self.position = data_start + u64::from(length);
-        if number(&self.header, b"op") == Some([op::CHUNK]) {
-            self.open_chunk(start, data_start, report);
-            self.records = self.file.records(self.position);
-            return Ok(Some(Outcome::Other));
-        }
-        let Self { records, header, data, connections, only, .. } = self;
-        read_body(records, length, (&*header, data), (connections, only), report, visitor).map(Some)
+    fn channels(&self) -> &BTreeMap<u32, Channel> {
+        &self.connections
     }
-
-    fn open_chunk(&mut self, start: u64, data_start: u64, report: &mut ReadReport) {
-        let compression = field(&self.header, b"compression").unwrap_or(b"none");
-        let compression = String::from_utf8_lossy(compression);
-        match self.file.chunk(&compression, (data_start, self.position), None) {
-            Ok(content) => self.chunk = Some(Chunk { content, start }),
-            Err(error) => report.skip(DAMAGED, format_args!("chunk at byte {start}: {error}")),
-        }
-        if self.position > self.file.size() {
-            report.skip(CUT, format_args!("at byte {}", self.file.size()));
-        }
-    }
-
-    /// Reads the next record of the open chunk; `None` at its end.
-    fn read_inner(
-        &mut self,
-        report: &mut ReadReport,
-        visitor: &mut Visitor,
-    ) -> Option<Result<Outcome, (u64, io::Error)>> {
-        let Self { chunk, header, data, connections, only, .. } = self;
-        let Chunk { content, start } = chunk.as_mut()?;
-        let length = match read_head(content, header) {
-            Ok(length) => length?,
-            Err(error) => return Some(Err((*start, error))),
-        };
-        let read =
-            read_body(content, length, (&*header, data), (connections, only), report, visitor);
-        Some(read.map_err(|error| (*start, error)))
-    }
-}
-
-const CUT: &str = "bag: cut short";
-const DAMAGED: &str = "bag: chunk damaged or cut short";
-
-impl MessageSource for Bag {
-    fn channels(&self) -> Vec<&Channel> {
-        self.connections.values().collect()
-    }
-
-    fn is_indexed(&self) -> bool {
-        self.is_indexed
-    }
-
-    fn only(&mut self, topics: Vec<String>) {
-        self.only = Some(topics);
-    }
-
-    fn visit_next(&mut self, report: &mut ReadReport, visitor: &mut Visitor) -> bool {
-        loop {
-            match self.read_inner(report, visitor) {
-                Some(Ok(Outcome::Message)) => return true,
-                Some(Ok(Outcome::Other)) => continue,
-                Some(Err((start, error))) => {
-                    report.skip(DAMAGED, format_args!("chunk at byte {start}: {error}"));
-                    self.chunk = None;
-                }
-                None => self.chunk = None,
-            }
-            let start = self.position;
-            match self.read_outer(report, visitor) {
-                Ok(Some(Outcome::Message)) => return true,
-                Ok(Some(Outcome::Other)) => {}
-                Ok(None) => return false,
-                Err(error) => {
-                    report.skip(CUT, format_args!("record at byte {start}: {error}"));
-                    // Without the length of this record the next one cannot be found.
-                    self.position = self.file.size();
-                    self.records = self.file.records(self.position);
-                }
-            }
-        }
-    }
-}
-
-enum Outcome {
-    Message,
-    Other,
-}
-
-/// Reads a record's header and the length of its data; `None` at the end.
-fn read_head(reader: &mut impl BufRead, header: &mut Vec<u8>) -> io::Result<Option<u32>> {
-    header.clear();
-    if reader.fill_buf()?.is_empty() {
-        return Ok(None);
-    }
-    let length = u32::from_le_bytes(read_array(reader)?);
-    if length > LARGEST_HEADER {
-        return Err(invalid(format!("a record header of {length} bytes")));
-    }
-    fill(reader, length.into(), header)?;
-    Ok(Some(u32::from_le_bytes(read_array(reader)?)))
-}
-
-/// Reads the data of a record that is no chunk.
-fn read_body(
-    reader: &mut impl BufRead,
-    length: u32,
-    (header, data): (&[u8], &mut Vec<u8>),
-    (connections, only): (&mut BTreeMap<u32, Channel>, &Option<Vec<String>>),
-    report: &mut ReadReport,
-    visitor: &mut Visitor,
-) -> io::Result<Outcome> {
-    let length = u64::from(length);
-    match number(header, b"op") {
-        Some([op::CONNECTION]) => {
-            fill(reader, length, data)?;
-            add_connection(connections, header, data);
-        }
-        Some([op::MESSAGE]) => {
-            let connection = number(header, b"conn").map(u32::from_le_bytes);
-            let channel = connection.and_then(|id| connections.get(&id));
-            if channel.is_none() {
-                let reason = "bag: message of an unknown connection";
-                report.skip(reason, format_args!("{connection:?}"));
-            }
-            let is_used = |topic: &String| only.as_ref().is_none_or(|only| only.contains(topic));
-            if let Some(channel) = channel.filter(|channel| is_used(&channel.topic)) {
-                fill(reader, length, data)?;
-                visitor(channel, data, report);
-                return Ok(Outcome::Message);
-            }
-            skip(reader, length)?;
-        }
-        _ => skip(reader, length)?,
-    }
-    Ok(Outcome::Other)
-}
-
-fn add_connection(connections: &mut BTreeMap<u32, Channel>, header: &[u8], data: &[u8]) {
-    let id = number(header, b"conn").map(u32::from_le_bytes);
-    let (Some(id), Some(topic), Some(schema)) = (id, field(header, b"topic"), field(data, b"type"))
-    else {
-        return;
-    };
-    connections.entry(id).or_insert_with(|| {
-        let schema = String::from_utf8_lossy(schema).into_owned();
-        let kind = MessageType::from_name(&schema).map(|kind| (kind, Serialization::Ros1));
-        Channel { topic: String::from_utf8_lossy(topic).into_owned(), schema, kind }
-    });
 }
 
 /// The value of a field of a header: a sequence of `length name=value`.

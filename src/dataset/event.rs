@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::odometry::Event;
+use crate::vision::CameraConfig;
 
 /// What a reader met: counts that end up in `metrics.json`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -39,6 +40,8 @@ pub struct LogSummary {
     pub sources: BTreeMap<String, String>,
     /// Number of frames, where the log knows it without being read through.
     pub frames: Option<u64>,
+    /// Calibration of the color camera and its mounting on the IMU, where the log tells both.
+    pub camera: Option<CameraConfig>,
 }
 
 /// A log that is being read. Events come ordered by stamp; memory stays bounded.
@@ -123,7 +126,7 @@ pub enum LogError {
     #[error("{path}: {source}")]
     Io { path: PathBuf, source: std::io::Error },
     #[error(
-        "{path}: not a log this program reads ({reason}); it reads .mcap, ROS 1 .bag, TUM RGB-D folders and 7-Scenes folders"
+        "{path}: not a log this program reads ({reason}); it reads .mcap, ROS 1 .bag, TUM RGB-D, EuRoC and 7-Scenes folders"
     )]
     UnknownFormat { path: PathBuf, reason: String },
     #[error("{path}: {reason}")]

@@ -5,16 +5,22 @@ use std::path::{Path, PathBuf};
 use super::merge::{Reading, ReadingSource};
 use super::pair::{Paired, Pairer};
 use super::pixels::{Rejection, compressed_color, compressed_depth};
+use super::ros::Role;
 use super::{LogConfig, LogError, ReadReport, TruthPose};
-use crate::inertial::Stamp;
+use crate::inertial::{ImuConfig, ImuSample, Stamp};
+use crate::vision::StereoRig;
 
 /// Files larger than this are not images of a log, bytes.
 const LARGEST_FILE: u64 = 256 << 20;
 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Entry {
+    /// The left one of two cameras, or the only one.
     Color(PathBuf),
+    Right(PathBuf),
     Depth(PathBuf),
+    /// As logged.
+    Imu(ImuSample),
     Truth(TruthPose),
 }
 
@@ -24,6 +30,8 @@ pub(super) struct Listing {
     pub entries: Vec<(Stamp, Entry)>,
     /// Reason and detail of each line or file left out.
     pub rejections: Vec<(String, String)>,
+    /// Where depth comes from two cameras.
+    pub stereo: Option<StereoRig>,
 }
 
 impl Listing {
@@ -37,8 +45,8 @@ impl Listing {
         for (stamp, entry) in &self.entries {
             match entry {
                 Entry::Color(_) => pairer.add_color(*stamp, ()),
-                Entry::Depth(_) => pairer.add_depth(*stamp, ()),
-                Entry::Truth(_) => false,
+                Entry::Depth(_) | Entry::Right(_) => pairer.add_depth(*stamp, ()),
+                Entry::Imu(_) | Entry::Truth(_) => false,
             };
         }
         let mut frames = 0;
@@ -54,15 +62,17 @@ pub(super) struct FolderSource {
     entries: std::vec::IntoIter<(Stamp, Entry)>,
     rejections: Vec<(String, String)>,
     config: LogConfig,
+    imu: ImuConfig,
 }
 
 impl FolderSource {
-    pub fn new(mut listing: Listing, config: &LogConfig) -> Self {
+    pub fn new(mut listing: Listing, config: &LogConfig, imu: &ImuConfig) -> Self {
         listing.entries.sort_by_key(|(stamp, _)| *stamp);
         Self {
             entries: listing.entries.into_iter(),
             rejections: listing.rejections,
             config: config.clone(),
+            imu: imu.clone(),
         }
     }
 }
@@ -73,28 +83,55 @@ impl ReadingSource for FolderSource {
             report.skip(&reason, detail);
         }
         for (stamp, entry) in self.entries.by_ref() {
-            let (role, path, reading) = match entry {
-                Entry::Truth(pose) => return Some(Reading::Truth(pose)),
-                Entry::Color(path) => {
-                    let image = read_file(&path).and_then(|bytes| compressed_color(&bytes));
-                    ("color image", path, image.map(|image| Reading::Color(stamp, image)))
-                }
-                Entry::Depth(path) => {
-                    let image =
-                        read_file(&path).and_then(|bytes| compressed_depth(&bytes, &self.config));
-                    ("depth image", path, image.map(|image| Reading::Depth(stamp, image)))
-                }
-            };
-            match reading {
+            match read_entry(stamp, &entry, &self.config, &self.imu) {
                 Ok(reading) => return Some(reading),
-                Err(Rejection { reason, detail }) => report.skip(
-                    &format!("{role}: {reason}"),
-                    format_args!("{}: {detail}", path.display()),
-                ),
+                Err(Rejection { reason, detail }) => {
+                    report.skip(&format!("{}: {reason}", entry.role().name()), detail);
+                }
             }
         }
         None
     }
+}
+
+impl Entry {
+    pub fn role(&self) -> Role {
+        match self {
+            Self::Color(_) => Role::Color,
+            Self::Depth(_) => Role::Depth,
+            Self::Right(_) => Role::Right,
+            Self::Imu(_) => Role::Imu,
+            Self::Truth(_) => Role::Truth,
+        }
+    }
+}
+
+/// The pose or the image of an entry; a rejection names the file.
+pub(super) fn read_entry(
+    stamp: Stamp,
+    entry: &Entry,
+    config: &LogConfig,
+    imu: &ImuConfig,
+) -> Result<Reading, Rejection> {
+    let (path, reading) = match entry {
+        Entry::Truth(pose) => return Ok(Reading::Truth(*pose)),
+        Entry::Imu(sample) => return Ok(Reading::Imu(sample.scaled(imu))),
+        Entry::Color(path) => {
+            let image = read_file(path).and_then(|bytes| compressed_color(&bytes));
+            (path, image.map(|image| Reading::Color(stamp, image)))
+        }
+        Entry::Right(path) => {
+            let image = read_file(path).and_then(|bytes| compressed_color(&bytes));
+            (path, image.map(|image| Reading::Right(stamp, image)))
+        }
+        Entry::Depth(path) => {
+            let image = read_file(path).and_then(|bytes| compressed_depth(&bytes, config));
+            (path, image.map(|image| Reading::Depth(stamp, image)))
+        }
+    };
+    reading.map_err(|Rejection { reason, detail }| {
+        Rejection::new(reason, format!("{}: {detail}", path.display()))
+    })
 }
 
 fn read_file(path: &Path) -> Result<Vec<u8>, Rejection> {

@@ -11,6 +11,8 @@ use crate::vision::{ColorImage, DepthImage};
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Reading {
     Color(Stamp, ColorImage),
+    /// Of the right one of two cameras; [`StereoSource`](super::stereo::StereoSource) takes it.
+    Right(Stamp, ColorImage),
     Depth(Stamp, DepthImage),
     Imu(ImuSample),
     Truth(TruthPose),
@@ -25,9 +27,20 @@ pub(super) trait ReadingSource: Send {
 impl Reading {
     fn stamp(&self) -> Stamp {
         match self {
-            Self::Color(stamp, _) | Self::Depth(stamp, _) => *stamp,
+            Self::Color(stamp, _) | Self::Right(stamp, _) | Self::Depth(stamp, _) => *stamp,
             Self::Imu(sample) => sample.stamp,
             Self::Truth(pose) => pose.stamp,
+        }
+    }
+
+    /// Width and height of an image.
+    pub fn image_size(&self) -> Option<(u32, u32)> {
+        match self {
+            Self::Color(_, image) | Self::Right(_, image) => {
+                Some((image.width() as u32, image.height() as u32))
+            }
+            Self::Depth(_, image) => Some((image.width() as u32, image.height() as u32)),
+            Self::Imu(_) | Self::Truth(_) => None,
         }
     }
 
@@ -37,13 +50,14 @@ impl Reading {
             Self::Depth(..) => 1,
             Self::Imu(_) => 2,
             Self::Truth(_) => 3,
+            Self::Right(..) => 4,
         }
     }
 
     /// Memory it takes in the buffer, bytes.
     fn size(&self) -> usize {
         match self {
-            Self::Color(_, image) => color_size(image),
+            Self::Color(_, image) | Self::Right(_, image) => color_size(image),
             Self::Depth(_, image) => depth_size(image),
             Self::Imu(_) | Self::Truth(_) => ENTRY_SIZE,
         }
@@ -61,7 +75,7 @@ fn depth_size(image: &DepthImage) -> usize {
     ENTRY_SIZE + 2 * image.data().len()
 }
 
-const STREAMS: [&str; 4] = ["color image", "depth image", "imu", "truth"];
+const STREAMS: [&str; 5] = ["color image", "depth image", "imu", "truth", "right image"];
 
 /// A step of a stream's stamps longer than this is believed only when the next message confirms
 /// it: one damaged stamp in the future would otherwise make all that follow it late.
@@ -230,6 +244,10 @@ impl ReorderBuffer {
             Reading::Depth(stamp, image) => self.images.add_depth(stamp, image),
             Reading::Imu(sample) => self.add_event(0, Event::Imu(sample)),
             Reading::Truth(pose) => self.add_event(1, Event::Truth(pose)),
+            Reading::Right(..) => {
+                report.skip("right image: no calibration", format_args!("at {stamp} s"));
+                return;
+            }
         };
         if !new {
             let reason = format!("{stream}: repeated stamp");

@@ -26,6 +26,8 @@ pub(super) enum MessageType {
     PoseStamped,
     TransformStamped,
     Odometry,
+    CameraInfo,
+    Transforms,
 }
 
 impl MessageType {
@@ -38,6 +40,8 @@ impl MessageType {
             "geometry_msgs/PoseStamped" => Some(Self::PoseStamped),
             "geometry_msgs/TransformStamped" => Some(Self::TransformStamped),
             "nav_msgs/Odometry" => Some(Self::Odometry),
+            "sensor_msgs/CameraInfo" => Some(Self::CameraInfo),
+            "tf2_msgs/TFMessage" | "tf/tfMessage" => Some(Self::Transforms),
             _ => None,
         }
     }
@@ -133,7 +137,7 @@ impl<'a> Fields<'a> {
     }
 
     /// `std_msgs/Header`.
-    fn header(&mut self) -> Result<Stamp, Rejection> {
+    pub fn header(&mut self) -> Result<Stamp, Rejection> {
         let seconds = match self.layout {
             Layout::Ros1 => {
                 let _sequence = self.u32()?;
@@ -213,11 +217,7 @@ pub(super) fn imu(mut fields: Fields, config: &ImuConfig) -> Result<ImuSample, R
             return Err(Rejection::new("no gyroscope or no accelerometer in the message", detail));
         }
     }
-    let sample = ImuSample {
-        stamp,
-        angular_velocity: angular_velocity * config.gyroscope_scale,
-        specific_force: acceleration * config.accelerometer_scale,
-    };
+    let sample = ImuSample { stamp, angular_velocity, specific_force: acceleration }.scaled(config);
     if !sample.is_finite() {
         return Err(Rejection::new("not finite", format!("at {stamp} s")));
     }

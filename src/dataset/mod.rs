@@ -5,29 +5,43 @@
 //! orders and pairs the readings. A log that is cut or damaged yields all that can still be read.
 
 mod bag;
+mod convert;
+mod definition;
+mod euroc;
 mod event;
 mod folder;
 mod imu_csv;
+mod inspect;
 mod mcap_file;
 mod merge;
 mod message;
 mod navigation_csv;
 mod open;
+mod output;
 mod pair;
 mod pixels;
+mod records;
 mod ros;
+mod ros2;
 #[cfg(test)]
 mod samples;
 mod section;
 mod seven_scenes;
+mod stereo;
 mod tum;
 mod write;
 
 use crate::odometry::{Event, TruthPose};
 use crate::vision::RgbdFrame;
 
+pub use convert::{ConvertError, ConvertSummary, convert};
 pub use event::{Log, LogConfig, LogError, LogSummary, ReadReport};
 pub use imu_csv::{ImuCsv, ImuRow};
+pub use inspect::{
+    AccelerometerUnit, Assumed, ColorInspection, DepthInspection, Evidence, Finding, Gap,
+    GyroscopeUnit, ImuInspection, Inspection, LogClock, PairInspection, Severity, Sign, Timing,
+    TopicInspection, Verdict, inspect,
+};
 pub use navigation_csv::{TableError, read_imu_table, read_position_table};
 pub use open::{detect, open};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

@@ -3,28 +3,56 @@
 use std::io::Read;
 use std::path::Path;
 
-use super::bag::{self, Bag};
-use super::folder::FolderSource;
-use super::mcap_file::{self, McapFile};
+use super::bag::{Bag, BagFormat};
+use super::folder::{FolderSource, Listing};
+use super::mcap_file::{McapFile, McapFormat};
 use super::merge::MergedLog;
+use super::records::Format as _;
 use super::ros::{MessageSource, RosSource, Survey};
 use super::section::LogFile;
-use super::{Log, LogConfig, LogError, LogSummary, seven_scenes, tum};
+use super::stereo::StereoSource;
+use super::{Log, LogConfig, LogError, LogSummary, euroc, seven_scenes, tum};
 use crate::inertial::ImuConfig;
 
-const BAG_KIND: &str = "ROS 1 bag";
-const MCAP_KIND: &str = "MCAP";
+/// What a path turned out to be.
+pub(super) enum Contents {
+    Folder(LogSummary, Listing),
+    Messages(MessageLog),
+}
 
-enum Format {
-    Mcap,
+/// A file of messages.
+pub(super) struct MessageLog {
+    file: LogFile,
+    format: MessageFormat,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum MessageFormat {
     Bag,
-    Tum,
-    SevenScenes,
+    Mcap,
+}
+
+impl MessageLog {
+    pub fn kind(&self) -> &'static str {
+        match self.format {
+            MessageFormat::Bag => "ROS 1 bag",
+            MessageFormat::Mcap => "MCAP",
+        }
+    }
+
+    /// The messages from the start.
+    pub fn messages(&self) -> Box<dyn MessageSource> {
+        match self.format {
+            MessageFormat::Bag => Box::new(Bag::new(self.file.clone())),
+            MessageFormat::Mcap => Box::new(McapFile::new(self.file.clone())),
+        }
+    }
 }
 
 /// Opens a log for reading.
 ///
-/// The format is guessed from the content: MCAP, ROS 1 bag, TUM RGB-D or 7-Scenes folder. Topics
+/// The format is guessed from the content: MCAP, ROS 1 bag, TUM RGB-D, EuRoC or 7-Scenes folder.
+/// Depth of a EuRoC folder comes from matching its two cameras. Topics
 /// that `log` leaves open are chosen by message type, which is logged. `imu` gives the units of
 /// the IMU. A log without IMU is allowed ([`LogSummary::has_imu`]); if `log.color_topic` and
 /// `log.depth_topic` are `"none"`, so is one without images.
@@ -35,17 +63,26 @@ enum Format {
 /// meaning, [`LogError::Io`] if it cannot be read.
 pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log>, LogError> {
     log.validate()?;
-    Ok(match guess(path)? {
-        Format::Tum => {
-            let (summary, listing) = tum::list(path, log)?;
-            open_folder(summary, FolderSource::new(listing, log), log)
+    Ok(match Contents::of(path, log)? {
+        Contents::Folder(summary, listing) => {
+            // The entries are sorted already.
+            let sorted = LogConfig { reorder_window: 0.0, ..log.clone() };
+            let stereo = listing.stereo.clone();
+            let source = FolderSource::new(listing, log, imu);
+            match stereo {
+                Some(rig) => {
+                    let source = StereoSource::new(source, rig, log);
+                    Box::new(MergedLog::new(source, summary, &sorted))
+                }
+                None => Box::new(MergedLog::new(source, summary, &sorted)),
+            }
         }
-        Format::SevenScenes => {
-            let (summary, listing) = seven_scenes::list(path, log)?;
-            open_folder(summary, FolderSource::new(listing, log), log)
+        Contents::Messages(messages) => {
+            let survey = Survey::new(messages.messages().as_mut());
+            let place = (path, messages.kind());
+            let (source, summary) = RosSource::new(messages.messages(), &survey, place, log, imu)?;
+            Box::new(MergedLog::new(source, summary, log))
         }
-        Format::Bag => open_messages(path, BAG_KIND, Bag::new, log, imu)?,
-        Format::Mcap => open_messages(path, MCAP_KIND, McapFile::new, log, imu)?,
     })
 }
 
@@ -57,65 +94,54 @@ pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log
 /// [`LogError::UnknownFormat`] if it is no log that is read, [`LogError::MissingStream`] if a
 /// folder lacks its image lists, [`LogError::Io`] if it cannot be read.
 pub fn detect(path: &Path) -> Result<LogSummary, LogError> {
-    let config = LogConfig::default();
-    Ok(match guess(path)? {
-        Format::Tum => tum::list(path, &config)?.0,
-        Format::SevenScenes => seven_scenes::list(path, &config)?.0,
-        Format::Bag => Survey::new(&mut Bag::new(LogFile::open(path)?)).summary(BAG_KIND),
-        Format::Mcap => Survey::new(&mut McapFile::new(LogFile::open(path)?)).summary(MCAP_KIND),
+    Ok(match Contents::of(path, &LogConfig::default())? {
+        Contents::Folder(summary, _) => summary,
+        Contents::Messages(messages) => {
+            Survey::new(messages.messages().as_mut()).summary(messages.kind())
+        }
     })
 }
 
-fn open_folder(summary: LogSummary, source: FolderSource, config: &LogConfig) -> Box<dyn Log> {
-    // The entries are sorted already.
-    let sorted = LogConfig { reorder_window: 0.0, ..config.clone() };
-    Box::new(MergedLog::new(source, summary, &sorted))
-}
-
-fn open_messages<M: MessageSource + 'static>(
-    path: &Path,
-    kind: &str,
-    open: impl Fn(LogFile) -> M,
-    log: &LogConfig,
-    imu: &ImuConfig,
-) -> Result<Box<dyn Log>, LogError> {
-    let file = LogFile::open(path)?;
-    let survey = Survey::new(&mut open(file.clone()));
-    let (source, summary) = RosSource::new(open(file), &survey, (path, kind), log, imu)?;
-    Ok(Box::new(MergedLog::new(source, summary, log)))
-}
-
-fn guess(path: &Path) -> Result<Format, LogError> {
-    let failed = |source| LogError::Io { path: path.to_path_buf(), source };
-    let unknown =
-        |reason: String| Err(LogError::UnknownFormat { path: path.to_path_buf(), reason });
-    if std::fs::metadata(path).map_err(failed)?.is_dir() {
-        return match () {
-            () if tum::is_tum(path) => Ok(Format::Tum),
-            () if seven_scenes::is_seven_scenes(path) => Ok(Format::SevenScenes),
-            () if path.ends_with("mav0") || path.join("mav0").is_dir() => {
-                unknown("EuRoC folders, which have no depth images, are not read yet".to_owned())
-            }
-            () if path.join("metadata.yaml").is_file() => {
-                unknown("a ROS 2 bag folder; name the .mcap file in it".to_owned())
-            }
-            () => unknown("a folder without rgb.txt and without frame-*.color.*".to_owned()),
-        };
-    }
-    let mut start = Vec::new();
-    let file = std::fs::File::open(path).map_err(failed)?;
-    file.take(16).read_to_end(&mut start).map_err(failed)?;
-    match () {
-        () if start.starts_with(mcap_file::MAGIC) => Ok(Format::Mcap),
-        () if start.starts_with(bag::MAGIC) => Ok(Format::Bag),
-        () if start.is_empty() => unknown("the file is empty".to_owned()),
-        () if start.starts_with(b"SQLite format 3") => {
-            unknown("a ROS 2 bag in SQLite; `ros2 bag convert` makes it MCAP".to_owned())
+impl Contents {
+    /// Guesses the format from the content.
+    pub fn of(path: &Path, config: &LogConfig) -> Result<Self, LogError> {
+        let failed = |source| LogError::Io { path: path.to_path_buf(), source };
+        let unknown =
+            |reason: String| Err(LogError::UnknownFormat { path: path.to_path_buf(), reason });
+        let folder = |(summary, listing)| Self::Folder(summary, listing);
+        let messages =
+            |format| LogFile::open(path).map(|file| Self::Messages(MessageLog { file, format }));
+        if std::fs::metadata(path).map_err(failed)?.is_dir() {
+            return match () {
+                () if tum::is_tum(path) => tum::list(path, config).map(folder),
+                () if seven_scenes::is_seven_scenes(path) => {
+                    seven_scenes::list(path, config).map(folder)
+                }
+                () if euroc::is_euroc(path) => euroc::list(path, config).map(folder),
+                () if path.ends_with("mav0") || path.join("mav0").is_dir() => {
+                    unknown("a EuRoC folder without cam0/sensor.yaml".to_owned())
+                }
+                () if path.join("metadata.yaml").is_file() => {
+                    unknown("a ROS 2 bag folder; name the .mcap file in it".to_owned())
+                }
+                () => unknown("a folder without rgb.txt and without frame-*.color.*".to_owned()),
+            };
         }
-        () if start.starts_with(b"#ROSBAG") => {
-            unknown("a bag of a format before 2.0; `rosbag migrate` updates it".to_owned())
+        let mut start = Vec::new();
+        let file = std::fs::File::open(path).map_err(failed)?;
+        file.take(16).read_to_end(&mut start).map_err(failed)?;
+        match () {
+            () if start.starts_with(McapFormat::MAGIC) => messages(MessageFormat::Mcap),
+            () if start.starts_with(BagFormat::MAGIC) => messages(MessageFormat::Bag),
+            () if start.is_empty() => unknown("the file is empty".to_owned()),
+            () if start.starts_with(b"SQLite format 3") => {
+                unknown("a ROS 2 bag in SQLite; `ros2 bag convert` makes it MCAP".to_owned())
+            }
+            () if start.starts_with(b"#ROSBAG") => {
+                unknown("a bag of a format before 2.0; `rosbag migrate` updates it".to_owned())
+            }
+            () => unknown(format!("it begins with `{}`", start.escape_ascii())),
         }
-        () => unknown(format!("it begins with `{}`", start.escape_ascii())),
     }
 }
 
@@ -413,14 +439,13 @@ mod tests {
         assert!(error(&folder.path().join("absent")).contains("absent"));
         assert!(error(folder.path()).contains("a folder without rgb.txt"));
         std::fs::create_dir(folder.path().join("mav0")).unwrap();
-        assert!(error(folder.path()).contains("EuRoC"));
-        assert!(error(&folder.path().join("mav0")).contains("not read yet"));
+        assert!(error(folder.path()).contains("EuRoC folder without cam0/sensor.yaml"));
     }
 
     #[test]
     fn empty_containers_lack_streams() {
         let folder = tempfile::tempdir().unwrap();
-        for bytes in [bag::MAGIC, mcap_file::MAGIC] {
+        for bytes in [BagFormat::MAGIC, McapFormat::MAGIC] {
             let path = samples::file(&folder, "log", bytes);
             let error = open_default(&path).err().unwrap().to_string();
             assert!(error.ends_with("no color image in this log; it has: no topics"), "{error}");

@@ -1,6 +1,7 @@
 //! ROS logs, whatever their container: which topic plays which role, and messages to readings.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::Path;
 
 use super::merge::{Reading, ReadingSource};
@@ -9,9 +10,10 @@ use super::pixels::{
     Rejection, color_format, compressed_color, compressed_depth, is_depth_encoding, raw_color,
     raw_depth,
 };
+use super::write::{CAMERA, CONFIGURATION};
 use super::{LogConfig, LogError, LogSummary, ReadReport};
-use crate::inertial::ImuConfig;
-use crate::vision::PixelFormat;
+use crate::inertial::{ImuConfig, Stamp};
+use crate::vision::{CameraConfig, PixelFormat};
 
 /// A connection of a bag or a channel of an MCAP file.
 #[derive(Debug, Clone, PartialEq)]
@@ -19,12 +21,52 @@ pub(super) struct Channel {
     pub topic: String,
     /// Name of the message type, as logged.
     pub schema: String,
-    /// `None` for a type or serialization that is not read.
-    pub kind: Option<(MessageType, Serialization)>,
+    /// Text of the message type's definition, as logged.
+    pub definition: String,
+    /// `None` for a type that is not read.
+    pub kind: Option<MessageType>,
+    /// `None` for one that is not read.
+    pub serialization: Option<Serialization>,
+    /// Notes of whoever wrote the log.
+    pub metadata: BTreeMap<String, String>,
 }
 
-/// Takes a message: its channel and its serialised content.
-pub(super) type Visitor<'a> = dyn FnMut(&Channel, &[u8], &mut ReadReport) + 'a;
+impl Channel {
+    /// Type and serialization of messages that are read.
+    pub fn readable(&self) -> Option<(MessageType, Serialization)> {
+        self.kind.zip(self.serialization)
+    }
+}
+
+/// Where a record is in its file.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    /// Of the record, or of the chunk that contains it, bytes.
+    pub offset: u64,
+    /// Number of the record in its chunk, from 1.
+    pub record: Option<u64>,
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.record {
+            Some(record) => write!(f, "record {record} of the chunk at byte {}", self.offset),
+            None => write!(f, "record at byte {}", self.offset),
+        }
+    }
+}
+
+/// A message as it is logged.
+pub(super) struct Message<'a> {
+    pub channel: &'a Channel,
+    /// On the clock of whoever logged it.
+    pub log_time: Stamp,
+    /// Serialised.
+    pub data: &'a [u8],
+    pub place: Place,
+}
+
+pub(super) type Visitor<'a> = dyn FnMut(&Message, &mut ReadReport) + 'a;
 
 /// The messages of a log in the order in which they were logged.
 pub(super) trait MessageSource: Send {
@@ -41,12 +83,15 @@ pub(super) trait MessageSource: Send {
     fn visit_next(&mut self, report: &mut ReadReport, visitor: &mut Visitor) -> bool;
 }
 
+/// What a stream of a log is used as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Role {
+pub(super) enum Role {
     Color,
     Depth,
     Imu,
     Truth,
+    /// The right one of two cameras.
+    Right,
 }
 
 impl Role {
@@ -59,15 +104,21 @@ impl Role {
             Self::Depth => "depth",
             Self::Imu => "imu",
             Self::Truth => "truth",
+            Self::Right => "right",
         }
     }
 
-    fn name(self) -> &'static str {
+    pub fn is_image(self) -> bool {
+        matches!(self, Self::Color | Self::Depth | Self::Right)
+    }
+
+    pub fn name(self) -> &'static str {
         match self {
             Self::Color => "color image",
             Self::Depth => "depth image",
             Self::Imu => "imu",
             Self::Truth => "truth",
+            Self::Right => "right image",
         }
     }
 
@@ -77,13 +128,14 @@ impl Role {
             Self::Depth => &config.depth_topic,
             Self::Imu => &config.imu_topic,
             Self::Truth => &config.truth_topic,
+            Self::Right => "none",
         }
     }
 
     fn takes(self, kind: MessageType) -> bool {
         use MessageType::*;
         match self {
-            Self::Color | Self::Depth => matches!(kind, Image | CompressedImage),
+            Self::Color | Self::Depth | Self::Right => matches!(kind, Image | CompressedImage),
             Self::Imu => kind == Imu,
             Self::Truth => matches!(kind, PoseStamped | TransformStamped | Odometry),
         }
@@ -116,7 +168,7 @@ impl Topic {
     fn new(channel: &Channel) -> Self {
         Self {
             schema: channel.schema.clone(),
-            kind: channel.kind.map(|(kind, _)| kind),
+            kind: channel.readable().map(|(kind, _)| kind),
             encoding: None,
             size: None,
             accelerations: Vec::new(),
@@ -127,21 +179,17 @@ impl Topic {
         matches!(self.kind, Some(MessageType::Image | MessageType::CompressedImage))
     }
 
-    fn observe(&mut self, channel: &Channel, data: &[u8]) -> Result<(), Rejection> {
-        let Some((kind, serialization)) = channel.kind else { return Ok(()) };
-        let fields = Fields::new(data, serialization)?;
-        match kind {
-            MessageType::Image if self.encoding.is_none() => {
-                let (_, image) = message::image(fields)?;
-                self.encoding = Some(image.encoding.to_owned());
-                self.size = Some((image.width, image.height));
-            }
-            MessageType::CompressedImage if self.encoding.is_none() => {
-                self.encoding = Some(message::compressed_image(fields)?.format.to_owned());
-            }
-            MessageType::Imu if self.accelerations.len() < SURVEY_IMU_SAMPLES => {
+    fn observe(&mut self, message: &Message) -> Result<(), Rejection> {
+        match message.channel.readable() {
+            Some((MessageType::Imu, serialization))
+                if self.accelerations.len() < SURVEY_IMU_SAMPLES =>
+            {
+                let fields = Fields::new(message.data, serialization)?;
                 let sample = message::imu(fields, &ImuConfig::default())?;
                 self.accelerations.push(sample.specific_force.norm());
+            }
+            _ if self.encoding.is_none() => {
+                (self.encoding, self.size) = encoding_and_size(message)?;
             }
             _ => {}
         }
@@ -165,6 +213,7 @@ impl Topic {
                 is_depth_encoding(encoding?).then_some(u32::from(self.size != color_size))
             }
             Role::Depth => message::is_depth_format(encoding?).then_some(2),
+            Role::Right => None,
             Role::Imu => Some(u32::from(self.accelerations.is_empty())),
             Role::Truth => match kind {
                 MessageType::PoseStamped => Some(0),
@@ -185,10 +234,31 @@ impl Topic {
     }
 }
 
+type EncodingAndSize = (Option<String>, Option<(u32, u32)>);
+
+/// Encoding, width and height of an image, as far as the message tells them.
+pub(super) fn encoding_and_size(message: &Message) -> Result<EncodingAndSize, Rejection> {
+    let Some((kind, serialization)) = message.channel.readable() else { return Ok((None, None)) };
+    let fields = Fields::new(message.data, serialization)?;
+    Ok(match kind {
+        MessageType::Image => {
+            let (_, image) = message::image(fields)?;
+            (Some(image.encoding.to_owned()), Some((image.width, image.height)))
+        }
+        MessageType::CompressedImage => {
+            (Some(message::compressed_image(fields)?.format.to_owned()), None)
+        }
+        _ => (None, None),
+    })
+}
+
 /// The topics of a log, by name.
 #[derive(Debug, Clone)]
 pub(super) struct Survey {
     topics: BTreeMap<String, Topic>,
+    /// As this program noted them when it wrote the log.
+    configuration: Option<String>,
+    camera: Option<CameraConfig>,
 }
 
 impl Survey {
@@ -202,12 +272,13 @@ impl Survey {
         // Faults are reported when the log is read in earnest.
         let mut unreported = ReadReport::default();
         while count < SURVEY_MESSAGES && bytes < SURVEY_BYTES {
-            let more = messages.visit_next(&mut unreported, &mut |channel, data, _| {
+            let more = messages.visit_next(&mut unreported, &mut |message, _| {
+                let channel = message.channel;
                 let topic =
                     topics.entry(channel.topic.clone()).or_insert_with(|| Topic::new(channel));
-                let _ = topic.observe(channel, data);
+                let _ = topic.observe(message);
                 count += 1;
-                bytes += data.len();
+                bytes += message.data.len();
             });
             let known = |topic: &Topic| {
                 (!topic.is_image() || topic.encoding.is_some())
@@ -218,7 +289,9 @@ impl Survey {
                 break;
             }
         }
-        Self { topics }
+        let note = |key| messages.channels().iter().find_map(|c| c.metadata.get(key).cloned());
+        let camera = note(CAMERA).and_then(|text| serde_json::from_str(&text).ok());
+        Self { topics, configuration: note(CONFIGURATION), camera }
     }
 
     /// Topics with their types and encodings, for messages to the user.
@@ -238,7 +311,10 @@ impl Survey {
         ranked.min().map(|(_, name)| name)
     }
 
-    fn config_name(&self) -> &'static str {
+    fn config_name(&self) -> &str {
+        if let Some(name) = &self.configuration {
+            return name;
+        }
         let is = |name: &str, role: Role| {
             let topic = self.topics.get(name);
             topic.is_some_and(|topic| topic.kind.is_some_and(|kind| role.takes(kind)))
@@ -252,7 +328,7 @@ impl Survey {
     }
 
     /// Chooses a topic for each role; `Err` names the first that is configured but not there.
-    fn choose(&self, config: &LogConfig) -> Result<BTreeMap<Role, String>, Role> {
+    pub fn choose(&self, config: &LogConfig) -> Result<BTreeMap<Role, String>, Role> {
         let mut chosen = BTreeMap::new();
         let mut color_size = None;
         for role in Role::ALL {
@@ -282,7 +358,13 @@ impl Survey {
         self.summary_of(kind, &chosen)
     }
 
-    fn summary_of(&self, kind: &str, chosen: &BTreeMap<Role, String>) -> LogSummary {
+    /// `role` is not there.
+    pub fn missing(&self, path: &Path, role: Role) -> LogError {
+        let available = self.describe();
+        LogError::MissingStream { path: path.to_path_buf(), role: role.name(), available }
+    }
+
+    pub fn summary_of(&self, kind: &str, chosen: &BTreeMap<Role, String>) -> LogSummary {
         LogSummary {
             kind: kind.to_owned(),
             config_name: self.config_name().to_owned(),
@@ -293,32 +375,29 @@ impl Survey {
                 .map(|(role, name)| (role.key().to_owned(), name.clone()))
                 .collect(),
             frames: None,
+            camera: self.camera.clone(),
         }
     }
 }
 
 /// Decodes the messages of the chosen topics.
-pub(super) struct RosSource<M> {
-    messages: M,
+pub(super) struct RosSource {
+    messages: Box<dyn MessageSource>,
     roles: BTreeMap<String, Role>,
     log: LogConfig,
     imu: ImuConfig,
 }
 
-impl<M: MessageSource> RosSource<M> {
+impl RosSource {
     /// `messages` from the start; `path` and `kind` for errors and the summary.
     pub fn new(
-        mut messages: M,
+        mut messages: Box<dyn MessageSource>,
         survey: &Survey,
         (path, kind): (&Path, &str),
         log: &LogConfig,
         imu: &ImuConfig,
     ) -> Result<(Self, LogSummary), LogError> {
-        let missing = |role: Role| LogError::MissingStream {
-            path: path.to_path_buf(),
-            role: role.name(),
-            available: survey.describe(),
-        };
+        let missing = |role: Role| survey.missing(path, role);
         let chosen = survey.choose(log).map_err(missing)?;
         for role in [Role::Color, Role::Depth] {
             if role.configured(log) != "none" && !chosen.contains_key(&role) {
@@ -337,18 +416,19 @@ impl<M: MessageSource> RosSource<M> {
     }
 }
 
-impl<M: MessageSource> ReadingSource for RosSource<M> {
+impl ReadingSource for RosSource {
     fn next_reading(&mut self, report: &mut ReadReport) -> Option<Reading> {
         let Self { messages, roles, log, imu } = self;
         loop {
             let mut reading = None;
-            let more = messages.visit_next(report, &mut |channel, data, report| {
-                let Some(role) = roles.get(&channel.topic) else { return };
-                match decode(*role, channel, data, log, imu) {
+            let more = messages.visit_next(report, &mut |message, report| {
+                let topic = &message.channel.topic;
+                let Some(role) = roles.get(topic) else { return };
+                match decode(*role, message, log, imu) {
                     Ok(decoded) => reading = Some(decoded),
                     Err(Rejection { reason, detail }) => report.skip(
                         &format!("{}: {reason}", role.name()),
-                        format_args!("{}: {detail}", channel.topic),
+                        format_args!("{topic}, {}: {detail}", message.place),
                     ),
                 }
             });
@@ -359,23 +439,33 @@ impl<M: MessageSource> ReadingSource for RosSource<M> {
     }
 }
 
-fn decode(
+/// The reading of a message that plays `role`.
+pub(super) fn decode(
     role: Role,
-    channel: &Channel,
-    data: &[u8],
+    message: &Message,
     log: &LogConfig,
     imu: &ImuConfig,
 ) -> Result<Reading, Rejection> {
-    let Some((kind, serialization)) = channel.kind.filter(|(kind, _)| role.takes(*kind)) else {
+    let channel = message.channel;
+    let Some((kind, serialization)) = channel.readable().filter(|(kind, _)| role.takes(*kind))
+    else {
         return Err(Rejection::new("unexpected message type", &channel.schema));
     };
-    let fields = Fields::new(data, serialization)?;
+    let fields = Fields::new(message.data, serialization)?;
     match (role, kind) {
         (Role::Imu, _) => message::imu(fields, imu).map(Reading::Imu),
         (Role::Truth, _) => message::pose(fields, kind).map(Reading::Truth),
         (Role::Color, MessageType::Image) => {
             let (stamp, raw) = message::image(fields)?;
             raw_color(&raw, log).map(|image| Reading::Color(stamp, image))
+        }
+        (Role::Right, MessageType::Image) => {
+            let (stamp, raw) = message::image(fields)?;
+            raw_color(&raw, log).map(|image| Reading::Right(stamp, image))
+        }
+        (Role::Right, _) => {
+            let image = message::compressed_image(fields)?;
+            compressed_color(image.data).map(|color| Reading::Right(image.stamp, color))
         }
         (Role::Color, _) => {
             let image = message::compressed_image(fields)?;

@@ -26,13 +26,6 @@ pub(super) struct LogFile {
     size: u64,
 }
 
-/// The decompressed content of a chunk.
-pub(super) struct Chunk {
-    pub content: Box<dyn BufRead + Send>,
-    /// Offset of its record in the file.
-    pub start: u64,
-}
-
 impl LogFile {
     pub fn open(path: &Path) -> Result<Self, LogError> {
         let failed = |source| LogError::Io { path: path.to_path_buf(), source };

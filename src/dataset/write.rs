@@ -1,15 +1,15 @@
 //! MCAP logs with ROS 2 messages.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use byteorder::LittleEndian;
-use mcap::records::MessageHeader;
-use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
-use serde::{Deserialize, Serialize, Serializer};
+use nalgebra::{Isometry3, UnitQuaternion};
+use serde::{Deserialize, Serialize};
 
+use super::definition::CDR_HEADER;
+use super::output::McapOutput;
+use super::ros2;
 use super::{Event, RgbdFrame, TruthPose};
 use crate::inertial::{ImuSample, Stamp};
 use crate::vision::{CameraConfig, ColorImage, DepthImage, PixelFormat};
@@ -37,11 +37,19 @@ pub struct LogWriterOptions {
     pub compression_level: u32,
     /// Log time minus header stamp, s.
     pub log_time_offset: f64,
+    /// Name of the shipped configuration that fits the sensors, noted in the log; empty: none.
+    #[serde(skip)]
+    pub configuration: String,
 }
 
 impl Default for LogWriterOptions {
     fn default() -> Self {
-        Self { quirks: Quirks::None, compression_level: 1, log_time_offset: 0.0 }
+        Self {
+            quirks: Quirks::None,
+            compression_level: 1,
+            log_time_offset: 0.0,
+            configuration: String::new(),
+        }
     }
 }
 
@@ -54,6 +62,8 @@ pub enum WriteError {
     Mcap { path: PathBuf, source: mcap::McapError },
     #[error("{path}: {topic}: {reason}")]
     Message { path: PathBuf, topic: &'static str, reason: String },
+    #[error("{path}: the log time {time} s is before the clock's origin")]
+    BeforeOrigin { path: PathBuf, time: Stamp },
 }
 
 /// Number of messages in a finished log.
@@ -72,6 +82,11 @@ const TRUTH: &str = "/truth/pose";
 const TRANSFORM: &str = "/tf";
 const STATIC_TRANSFORM: &str = "/tf_static";
 
+/// Keys of the metadata of the channel [`CAMERA_INFO`]: the name of a shipped configuration that
+/// fits, and the camera's calibration with its mounting, as JSON.
+pub(super) const CONFIGURATION: &str = "mfg-vio:configuration";
+pub(super) const CAMERA: &str = "mfg-vio:camera";
+
 const WORLD_FRAME: &str = "world";
 const BODY_FRAME: &str = "imu";
 const CAMERA_FRAME: &str = "camera";
@@ -80,33 +95,22 @@ const CAMERA_FRAME: &str = "camera";
 /// few megabytes. Without [`LogWriter::finish`] the file has no index.
 pub struct LogWriter {
     path: PathBuf,
-    mcap: mcap::Writer<BufWriter<File>>,
+    output: McapOutput,
     options: LogWriterOptions,
     camera: Option<CameraConfig>,
     channels: BTreeMap<&'static str, u16>,
-    sequence: BTreeMap<u16, u32>,
     summary: WriteSummary,
     buffer: Vec<u8>,
 }
 
 impl LogWriter {
     pub fn create(path: &Path, options: LogWriterOptions) -> Result<Self, WriteError> {
-        let io = |source| WriteError::Io { path: path.to_owned(), source };
-        let file = BufWriter::new(File::create(path).map_err(io)?);
-        let mcap = mcap::WriteOptions::new()
-            .profile("ros2")
-            .chunk_size(Some(4 << 20))
-            .compression_level(options.compression_level)
-            .compression_threads(1)
-            .create(file)
-            .map_err(|source| WriteError::Mcap { path: path.to_owned(), source })?;
         Ok(Self {
             path: path.to_owned(),
-            mcap,
+            output: McapOutput::create(path, options.compression_level)?,
             options,
             camera: None,
             channels: BTreeMap::new(),
-            sequence: BTreeMap::new(),
             summary: WriteSummary::default(),
             buffer: Vec::new(),
         })
@@ -134,8 +138,8 @@ impl LogWriter {
         // "No estimate" of the orientation, as the message's definition asks.
         let mut no_orientation = [0.0; 9];
         no_orientation[0] = -1.0;
-        let message = message::Imu {
-            header: message::Header::new(sample.stamp, BODY_FRAME),
+        let message = ros2::Imu {
+            header: ros2::Header::new(sample.stamp, BODY_FRAME),
             orientation: UnitQuaternion::identity().into(),
             orientation_covariance: no_orientation,
             angular_velocity: sample.angular_velocity.into(),
@@ -147,10 +151,12 @@ impl LogWriter {
         self.write(IMU, sample.stamp, &message)
     }
 
-    /// Writes color and depth (as millimetres) under the same stamp.
+    /// Writes color and depth under the same stamp; depth that is logged in other units than
+    /// millimetres as floating-point metres.
     pub fn frame(&mut self, frame: &RgbdFrame) -> Result<(), WriteError> {
         if let Some(camera) = &self.camera {
-            let message = message::CameraInfo::new(camera, frame.stamp, &frame.color);
+            let header = ros2::Header::new(frame.stamp, CAMERA_FRAME);
+            let message = ros2::CameraInfo::new(header, camera, &frame.color);
             self.write(CAMERA_INFO, frame.stamp, &message)?;
         }
         self.color(frame.stamp, &frame.color)?;
@@ -161,8 +167,8 @@ impl LogWriter {
 
     /// Writes a pose, and the same as a transform, by which viewers place the camera.
     pub fn truth(&mut self, pose: &TruthPose) -> Result<(), WriteError> {
-        let message = message::PoseStamped {
-            header: message::Header::new(pose.stamp, WORLD_FRAME),
+        let message = ros2::PoseStamped {
+            header: ros2::Header::new(pose.stamp, WORLD_FRAME),
             pose: (&pose.world_from_body).into(),
         };
         self.summary.truth_poses += 1;
@@ -178,12 +184,12 @@ impl LogWriter {
         [parent, child]: [&'static str; 2],
         parent_from_child: &Isometry3<f64>,
     ) -> Result<(), WriteError> {
-        let transform = message::TransformStamped {
-            header: message::Header::new(stamp, parent),
+        let transform = ros2::TransformStamped {
+            header: ros2::Header::new(stamp, parent),
             child_frame_id: child,
             transform: parent_from_child.into(),
         };
-        self.write(topic, stamp, &message::TfMessage { transforms: vec![transform] })
+        self.write(topic, stamp, &ros2::TfMessage { transforms: vec![transform] })
     }
 
     pub fn event(&mut self, event: &Event) -> Result<(), WriteError> {
@@ -195,11 +201,8 @@ impl LogWriter {
     }
 
     /// Writes the index; the log is complete only after this.
-    pub fn finish(mut self) -> Result<WriteSummary, WriteError> {
-        let finished = self.mcap.finish();
-        finished.map_err(|source| WriteError::Mcap { path: self.path.clone(), source })?;
-        let io = |source| WriteError::Io { path: self.path.clone(), source };
-        self.mcap.into_inner().into_inner().map_err(|e| io(e.into_error()))?;
+    pub fn finish(self) -> Result<WriteSummary, WriteError> {
+        self.output.finish()?;
         Ok(self.summary)
     }
 
@@ -216,28 +219,36 @@ impl LogWriter {
             (PixelFormat::Rgb8, Quirks::None) => ("rgb8", image.data()),
             (PixelFormat::Bgr8, Quirks::None) => ("bgr8", image.data()),
         };
-        let message = message::Image {
-            header: message::Header::new(stamp, CAMERA_FRAME),
+        let message = ros2::Image {
+            header: ros2::Header::new(stamp, CAMERA_FRAME),
             height: image.height() as u32,
             width: image.width() as u32,
             encoding,
             is_bigendian: 0,
             step: (image.width() * channels) as u32,
-            data: message::Bytes(data),
+            data: ros2::Bytes(data),
         };
         self.write(COLOR, stamp, &message)
     }
 
     fn depth(&mut self, stamp: Stamp, image: &DepthImage) -> Result<(), WriteError> {
-        let data = millimetres(image);
-        let message = message::Image {
-            header: message::Header::new(stamp, CAMERA_FRAME),
+        let in_millimetres = (f64::from(image.scale()) * 1000.0 - 1.0).abs() < 1e-6;
+        let values = image.data().iter();
+        let (encoding, size, data): (_, _, Vec<u8>) = match in_millimetres {
+            true => ("16UC1", 2, values.flat_map(|raw| raw.to_le_bytes()).collect()),
+            false => {
+                let metres = |raw: &u16| (f32::from(*raw) * image.scale()).to_le_bytes();
+                ("32FC1", 4, values.flat_map(metres).collect())
+            }
+        };
+        let message = ros2::Image {
+            header: ros2::Header::new(stamp, CAMERA_FRAME),
             height: image.height() as u32,
             width: image.width() as u32,
-            encoding: "16UC1",
+            encoding,
             is_bigendian: 0,
-            step: 2 * image.width() as u32,
-            data: message::Bytes(&data),
+            step: size * image.width() as u32,
+            data: ros2::Bytes(&data),
         };
         self.write(DEPTH, stamp, &message)
     }
@@ -248,42 +259,37 @@ impl LogWriter {
         stamp: Stamp,
         message: &M,
     ) -> Result<(), WriteError> {
-        let refused =
-            |reason: String| WriteError::Message { path: self.path.clone(), topic, reason };
-        let log_time = stamp.offset_by(self.options.log_time_offset).nanos();
-        let Ok(log_time) = u64::try_from(log_time) else {
-            return Err(refused(format!("its time {stamp} s is before the clock's origin")));
-        };
-        let mut buffer = std::mem::take(&mut self.buffer);
-        buffer.clear();
-        // The encapsulation header: plain CDR, little endian.
-        buffer.extend([0, 1, 0, 0]);
-        cdr_encoding::to_writer::<_, LittleEndian, _>(&mut buffer, message)
-            .map_err(|e| refused(e.to_string()))?;
-        let written = self.channel(topic).and_then(|channel_id| {
-            let sequence = self.sequence.entry(channel_id).or_default();
-            let header =
-                MessageHeader { channel_id, sequence: *sequence, log_time, publish_time: log_time };
-            *sequence = sequence.wrapping_add(1);
-            self.mcap.write_to_known_channel(&header, &buffer)
-        });
-        self.buffer = buffer;
-        written.map_err(|source| WriteError::Mcap { path: self.path.clone(), source })
+        let channel = self.channel(topic)?;
+        self.buffer.clear();
+        self.buffer.extend(CDR_HEADER);
+        cdr_encoding::to_writer::<_, LittleEndian, _>(&mut self.buffer, message).map_err(|e| {
+            WriteError::Message { path: self.path.clone(), topic, reason: e.to_string() }
+        })?;
+        let log_time = stamp.offset_by(self.options.log_time_offset);
+        self.output.write(channel, log_time, &self.buffer)
     }
 
-    fn channel(&mut self, topic: &'static str) -> Result<u16, mcap::McapError> {
+    fn channel(&mut self, topic: &'static str) -> Result<u16, WriteError> {
         if let Some(id) = self.channels.get(topic) {
             return Ok(*id);
         }
-        let (name, definition) = match topic {
-            IMU => ("sensor_msgs/msg/Imu", message::IMU_DEFINITION),
-            CAMERA_INFO => ("sensor_msgs/msg/CameraInfo", message::CAMERA_INFO_DEFINITION),
-            TRUTH => ("geometry_msgs/msg/PoseStamped", message::POSE_DEFINITION),
-            TRANSFORM | STATIC_TRANSFORM => ("tf2_msgs/msg/TFMessage", message::TF_DEFINITION),
-            _ => ("sensor_msgs/msg/Image", message::IMAGE_DEFINITION),
+        let schema = match topic {
+            IMU => ("sensor_msgs/msg/Imu", ros2::IMU_DEFINITION),
+            CAMERA_INFO => ("sensor_msgs/msg/CameraInfo", ros2::CAMERA_INFO_DEFINITION),
+            TRUTH => ("geometry_msgs/msg/PoseStamped", ros2::POSE_DEFINITION),
+            TRANSFORM | STATIC_TRANSFORM => ("tf2_msgs/msg/TFMessage", ros2::TF_DEFINITION),
+            _ => ("sensor_msgs/msg/Image", ros2::IMAGE_DEFINITION),
         };
-        let schema = self.mcap.add_schema(name, "ros2msg", definition.as_bytes())?;
-        let id = self.mcap.add_channel(schema, topic, "cdr", &BTreeMap::new())?;
+        let mut metadata = BTreeMap::new();
+        if topic == CAMERA_INFO {
+            let camera = self.camera.as_ref().and_then(|c| serde_json::to_string(c).ok());
+            metadata.extend(camera.map(|camera| (CAMERA.to_owned(), camera)));
+            let configuration = &self.options.configuration;
+            if !configuration.is_empty() {
+                metadata.insert(CONFIGURATION.to_owned(), configuration.clone());
+            }
+        }
+        let id = self.output.channel(topic, schema, &metadata)?;
         self.channels.insert(topic, id);
         Ok(id)
     }
@@ -295,267 +301,10 @@ fn swap_red_and_blue(data: &[u8]) -> Vec<u8> {
     swapped
 }
 
-/// Little-endian millimetres; depths beyond 65.5 m become "none".
-fn millimetres(image: &DepthImage) -> Vec<u8> {
-    let factor = f64::from(image.scale()) * 1000.0;
-    let exact = (factor - 1.0).abs() < 1e-6;
-    let convert = |raw: u16| {
-        let value = (f64::from(raw) * factor).round();
-        if value <= f64::from(u16::MAX) { value as u16 } else { 0 }
-    };
-    let values = image.data().iter();
-    values.flat_map(|raw| if exact { *raw } else { convert(*raw) }.to_le_bytes()).collect()
-}
-
-/// The messages' fields in their order, and the text of their definitions.
-mod message {
-    use super::*;
-
-    #[derive(Serialize)]
-    pub struct Header {
-        seconds: i32,
-        nanoseconds: u32,
-        frame_id: &'static str,
-    }
-
-    impl Header {
-        pub fn new(stamp: Stamp, frame_id: &'static str) -> Self {
-            let nanos = stamp.nanos();
-            Self {
-                seconds: nanos.div_euclid(1_000_000_000) as i32,
-                nanoseconds: nanos.rem_euclid(1_000_000_000) as u32,
-                frame_id,
-            }
-        }
-    }
-
-    /// A sequence of bytes, written in one piece.
-    pub struct Bytes<'a>(pub &'a [u8]);
-
-    impl Serialize for Bytes<'_> {
-        fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-            serializer.serialize_bytes(self.0)
-        }
-    }
-
-    #[derive(Serialize)]
-    pub struct Image<'a> {
-        pub header: Header,
-        pub height: u32,
-        pub width: u32,
-        pub encoding: &'static str,
-        pub is_bigendian: u8,
-        pub step: u32,
-        pub data: Bytes<'a>,
-    }
-
-    #[derive(Serialize)]
-    pub struct Vector {
-        x: f64,
-        y: f64,
-        z: f64,
-    }
-
-    impl From<Vector3<f64>> for Vector {
-        fn from(v: Vector3<f64>) -> Self {
-            Self { x: v.x, y: v.y, z: v.z }
-        }
-    }
-
-    #[derive(Serialize)]
-    pub struct Orientation {
-        x: f64,
-        y: f64,
-        z: f64,
-        w: f64,
-    }
-
-    impl From<UnitQuaternion<f64>> for Orientation {
-        fn from(q: UnitQuaternion<f64>) -> Self {
-            let q: Quaternion<f64> = q.into_inner();
-            Self { x: q.i, y: q.j, z: q.k, w: q.w }
-        }
-    }
-
-    /// `Pose` and `Transform` alike: a vector, then a quaternion.
-    #[derive(Serialize)]
-    pub struct Transform {
-        translation: Vector,
-        rotation: Orientation,
-    }
-
-    impl From<&Isometry3<f64>> for Transform {
-        fn from(isometry: &Isometry3<f64>) -> Self {
-            Self {
-                translation: isometry.translation.vector.into(),
-                rotation: isometry.rotation.into(),
-            }
-        }
-    }
-
-    #[derive(Serialize)]
-    pub struct Imu {
-        pub header: Header,
-        pub orientation: Orientation,
-        pub orientation_covariance: [f64; 9],
-        pub angular_velocity: Vector,
-        pub angular_velocity_covariance: [f64; 9],
-        pub linear_acceleration: Vector,
-        pub linear_acceleration_covariance: [f64; 9],
-    }
-
-    #[derive(Serialize)]
-    pub struct PoseStamped {
-        pub header: Header,
-        pub pose: Transform,
-    }
-
-    #[derive(Serialize)]
-    pub struct TransformStamped {
-        pub header: Header,
-        pub child_frame_id: &'static str,
-        pub transform: Transform,
-    }
-
-    #[derive(Serialize)]
-    pub struct TfMessage {
-        pub transforms: Vec<TransformStamped>,
-    }
-
-    #[derive(Serialize)]
-    struct RegionOfInterest {
-        x_offset: u32,
-        y_offset: u32,
-        height: u32,
-        width: u32,
-        do_rectify: bool,
-    }
-
-    #[derive(Serialize)]
-    pub struct CameraInfo {
-        header: Header,
-        height: u32,
-        width: u32,
-        distortion_model: &'static str,
-        d: Vec<f64>,
-        k: [f64; 9],
-        r: [f64; 9],
-        p: [f64; 12],
-        binning_x: u32,
-        binning_y: u32,
-        roi: RegionOfInterest,
-    }
-
-    impl CameraInfo {
-        pub fn new(camera: &CameraConfig, stamp: Stamp, image: &ColorImage) -> Self {
-            let CameraConfig { fx, fy, cx, cy, .. } = *camera;
-            Self {
-                header: Header::new(stamp, CAMERA_FRAME),
-                height: image.height() as u32,
-                width: image.width() as u32,
-                distortion_model: "plumb_bob",
-                d: camera.distortion.to_vec(),
-                k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
-                r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-                p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
-                binning_x: 0,
-                binning_y: 0,
-                roi: RegionOfInterest {
-                    x_offset: 0,
-                    y_offset: 0,
-                    height: 0,
-                    width: 0,
-                    do_rectify: false,
-                },
-            }
-        }
-    }
-
-    macro_rules! part {
-        ($name:literal, $fields:literal) => {
-            concat!(
-                "================================================================================\n",
-                "MSG: ",
-                $name,
-                "\n",
-                $fields
-            )
-        };
-    }
-    macro_rules! header {
-        () => {
-            concat!(
-                part!("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"),
-                part!("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n")
-            )
-        };
-    }
-    macro_rules! quaternion {
-        () => {
-            part!(
-                "geometry_msgs/Quaternion",
-                "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"
-            )
-        };
-    }
-    macro_rules! vector {
-        () => {
-            part!("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n")
-        };
-    }
-
-    pub const IMAGE_DEFINITION: &str = concat!(
-        "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n",
-        "uint8 is_bigendian\nuint32 step\nuint8[] data\n",
-        header!()
-    );
-    pub const IMU_DEFINITION: &str = concat!(
-        "std_msgs/Header header\n",
-        "geometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n",
-        "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n",
-        "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n",
-        header!(),
-        quaternion!(),
-        vector!()
-    );
-    pub const CAMERA_INFO_DEFINITION: &str = concat!(
-        "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\n",
-        "float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n",
-        "uint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n",
-        header!(),
-        part!(
-            "sensor_msgs/RegionOfInterest",
-            "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n"
-        )
-    );
-    pub const POSE_DEFINITION: &str = concat!(
-        "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
-        header!(),
-        part!(
-            "geometry_msgs/Pose",
-            "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
-        ),
-        part!("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z\n"),
-        quaternion!()
-    );
-    pub const TF_DEFINITION: &str = concat!(
-        "geometry_msgs/TransformStamped[] transforms\n",
-        part!(
-            "geometry_msgs/TransformStamped",
-            "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
-        ),
-        header!(),
-        part!(
-            "geometry_msgs/Transform",
-            "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
-        ),
-        vector!(),
-        quaternion!()
-    );
-}
-
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector3;
+
     use super::*;
 
     /// Topic, schema name and CDR body of each message of a log.
@@ -629,9 +378,22 @@ mod tests {
     }
 
     #[test]
-    fn depth_becomes_millimetres() {
+    fn depth_in_millimetres_is_written_so_and_other_depth_in_metres() {
         let messages = written(LogWriterOptions::default());
         let depth = body(&messages, DEPTH);
+        assert!(depth.windows(6).any(|w| w == b"32FC1\0"));
+        let metres = &depth[depth.len() - 8..];
+        assert_eq!(metres, [1_f32.to_le_bytes(), 0_f32.to_le_bytes()].concat());
+
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log.mcap");
+        let mut log = LogWriter::create(&path, LogWriterOptions::default()).unwrap();
+        let depth = DepthImage::new(2, 1, 0.001, vec![1000, 0]).unwrap();
+        log.frame(&RgbdFrame { depth, ..frame() }).unwrap();
+        log.finish().unwrap();
+        let messages = super::tests::messages(&path);
+        let depth = body(&messages, DEPTH);
+        assert!(depth.windows(6).any(|w| w == b"16UC1\0"));
         assert_eq!(depth[depth.len() - 4..], [232, 3, 0, 0]);
     }
 
@@ -677,7 +439,7 @@ mod tests {
         let options = LogWriterOptions { log_time_offset: -20.0, ..LogWriterOptions::default() };
         let mut log = LogWriter::create(&folder.path().join("log.mcap"), options).unwrap();
         let error = log.frame(&frame()).unwrap_err().to_string();
-        assert!(error.contains(COLOR), "{error}");
+        assert!(error.contains("log.mcap") && error.contains("-8.000"), "{error}");
     }
 
     #[test]

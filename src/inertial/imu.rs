@@ -14,6 +14,15 @@ pub struct ImuSample {
 }
 
 impl ImuSample {
+    /// A reading as logged, in SI units.
+    pub fn scaled(&self, config: &ImuConfig) -> Self {
+        Self {
+            stamp: self.stamp,
+            angular_velocity: self.angular_velocity * config.gyroscope_scale,
+            specific_force: self.specific_force * config.accelerometer_scale,
+        }
+    }
+
     pub fn is_finite(&self) -> bool {
         let finite = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
         finite(&self.angular_velocity) && finite(&self.specific_force)

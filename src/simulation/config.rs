@@ -151,6 +151,8 @@ impl Default for TruthConfig {
 pub enum SceneError {
     #[error("{path}: {source}")]
     Io { path: PathBuf, source: std::io::Error },
+    #[error("scene: room.images: {path}: {source}")]
+    Image { path: PathBuf, source: image::ImageError },
     #[error("{path}: {reason}")]
     Syntax { path: PathBuf, reason: String },
     #[error("scene: {key} = {value}: {requirement}")]

@@ -444,7 +444,7 @@ mod tests {
 
     fn renderer(noise: f64) -> Renderer {
         let room = RoomConfig { clutter: 4, ..small_room() };
-        let world = World::furnished(&room, &PeopleConfig::default(), &[Vector3::zeros()], 1);
+        let world = World::furnished(&room, &PeopleConfig::default(), &[Vector3::zeros()], &[], 1);
         let camera = PinholeCamera { fx: 120.0, fy: 120.0, cx: 79.5, cy: 59.5 };
         let image = ImageConfig { width: 160, height: 120, noise, ..ImageConfig::default() };
         Renderer::new(world, camera, image, DepthConfig::default(), DropoutConfig::default(), 7)
@@ -478,7 +478,7 @@ mod tests {
     #[test]
     fn an_empty_room_has_the_depth_of_its_walls() {
         let room = RoomConfig { clutter: 0, ..small_room() };
-        let world = World::furnished(&room, &PeopleConfig::default(), &[], 1);
+        let world = World::furnished(&room, &PeopleConfig::default(), &[], &[], 1);
         let mut renderer = Renderer { world, ..renderer(0.0) };
         renderer.dropout = DropoutConfig { anywhere: 0.0, edges: 0.0, grazing_cosine: 0.0 };
         let (_, depth) = renderer.render(&looking_ahead(0)).unwrap();

@@ -1,4 +1,5 @@
 use std::ops::ControlFlow;
+use std::path::PathBuf;
 use std::sync::mpsc::sync_channel;
 
 use nalgebra::{Isometry3, Vector3};
@@ -7,6 +8,7 @@ use super::config::{SceneConfig, SceneError};
 use super::inertial::ImuSimulator;
 use super::motion::{BodyState, Motion};
 use super::render::{Renderer, Shot};
+use super::texture::Picture;
 use super::world::{RoomConfig, World};
 use crate::dataset::{LogWriter, WriteError, WriteSummary};
 use crate::inertial::Stamp;
@@ -86,7 +88,8 @@ impl Simulation {
             .map(|k| motion.state(k as f64 / 4.0).world_from_body.translation.vector)
             .collect();
         config.room.size = room_around(&config.room, &path)?;
-        let world = World::furnished(&config.room, &config.people, &path, seed(2));
+        let pictures = pictures(&config.room)?;
+        let world = World::furnished(&config.room, &config.people, &path, &pictures, seed(2));
         let renderer = Renderer::new(
             world,
             PinholeCamera::from(&config.camera),
@@ -224,6 +227,14 @@ fn duration(config: &SceneConfig, motion: &Motion) -> Result<f64, SceneError> {
     }
 }
 
+/// The image files of a room.
+fn pictures(room: &RoomConfig) -> Result<Vec<Picture>, SceneError> {
+    let load = |path: &PathBuf| {
+        Picture::load(path).map_err(|source| SceneError::Image { path: path.clone(), source })
+    };
+    room.images.iter().map(load).collect()
+}
+
 /// The size of the room, enlarged where the path and the furniture around it need more.
 fn room_around(room: &RoomConfig, path: &[Vector3<f64>]) -> Result<[f64; 3], SceneError> {
     const FURNITURE: f64 = 0.6;
@@ -242,7 +253,7 @@ fn room_around(room: &RoomConfig, path: &[Vector3<f64>]) -> Result<[f64; 3], Sce
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Point2;
+    use nalgebra::{Matrix2, Point2, Vector2};
 
     use super::*;
     use crate::vision::{ColorImage, DepthConfig};
@@ -275,6 +286,7 @@ mod tests {
         simulation.filter_map(frame).collect()
     }
 
+    /// Green channel between pixels; `None` outside.
     fn green(image: &ColorImage, pixel: Point2<f64>) -> Option<f64> {
         let (x, y) = (pixel.x.floor(), pixel.y.floor());
         let inside = x >= 0.0
@@ -291,6 +303,29 @@ mod tests {
         })
     }
 
+    /// The shift that brings a later image into agreement with what an earlier one shows, by
+    /// Gauss-Newton steps; `matches` are pixels of the later image and the earlier one's colors.
+    /// `None` where the texture does not determine it or runs out of the image.
+    fn residual_shift(later: &ColorImage, matches: &[(Point2<f64>, f64)]) -> Option<Vector2<f64>> {
+        let mut shift = Vector2::zeros();
+        for _ in 0..6 {
+            let (mut normal, mut right) = (Matrix2::zeros(), Vector2::zeros());
+            for (pixel, color) in matches {
+                let at = |x, y| green(later, pixel + shift + Vector2::new(x, y));
+                let gradient =
+                    Vector2::new(at(0.5, 0.0)? - at(-0.5, 0.0)?, at(0.0, 0.5)? - at(0.0, -0.5)?);
+                normal += gradient * gradient.transpose();
+                right += gradient * (color - at(0.0, 0.0)?);
+            }
+            let contrast = normal.symmetric_eigenvalues().min() / matches.len() as f64;
+            if contrast < 30.0 {
+                return None;
+            }
+            shift += normal.cholesky()?.solve(&right);
+        }
+        Some(shift)
+    }
+
     #[test]
     fn events_are_ordered_and_complete() {
         let mut scene = small_scene();
@@ -305,8 +340,8 @@ mod tests {
         assert_eq!(count(|e| matches!(e, Event::Frame(_))), 11);
     }
 
-    /// Pixels carried by depth and true poses to a later frame find the same depth and, to a
-    /// fraction of a pixel, the same texture there.
+    /// Pixels carried by depth and true poses to a later frame land where the same texture is,
+    /// within half a pixel, at the same depth, within two sigma.
     #[test]
     fn truth_carries_pixels_from_frame_to_frame() {
         let scene = small_scene();
@@ -319,41 +354,44 @@ mod tests {
         assert!(later_from_first.translation.vector.norm() > 0.03);
         let camera = PinholeCamera::from(&scene.camera);
         let law: &DepthConfig = &scene.depth;
-        let (mut seen, mut agreeing) = (0, 0);
-        // Squared color differences with the landing point moved by half a pixel each way.
-        let moves = [(0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)];
-        let mut difference = [0.0; 5];
-        for row in 4..116 {
-            for column in 4..156 {
-                let Some(depth) = first.depth.at(column, row) else { continue };
-                let pixel = Point2::new(column as f64, row as f64);
-                let point = later_from_first
-                    * nalgebra::Point3::from(camera.unproject(pixel, depth.into()));
-                let Some(landed) = camera.project(&point.coords) else { continue };
-                let (x, y) = (landed.x.round(), landed.y.round());
-                if !(4.0..156.0).contains(&x) || !(4.0..116.0).contains(&y) {
-                    continue;
-                }
-                let Some(found) = later.depth.at(x as usize, y as usize) else { continue };
-                seen += 1;
-                // Both readings are noisy, and a pixel spans some depth on slanted surfaces.
-                let sigma = law.standard_deviation(point.z) * std::f64::consts::SQRT_2;
-                if (f64::from(found) - point.z).abs() > 2.0 * sigma + 0.01 * point.z {
-                    continue;
-                }
-                agreeing += 1;
-                let colors = moves
-                    .map(|(dx, dy)| green(&later.color, Point2::new(landed.x + dx, landed.y + dy)));
-                let Some(reference) = green(&first.color, pixel) else { continue };
-                for (sum, color) in difference.iter_mut().zip(colors) {
-                    *sum += color.map_or(0.0, |c| (c - reference).powi(2));
-                }
+        let carry = |pixel: Point2<f64>| {
+            let depth = law.read(&first.depth, pixel)?.depth;
+            let point = later_from_first * nalgebra::Point3::from(camera.unproject(pixel, depth));
+            Some((camera.project(&point.coords)?, point.z))
+        };
+        let (mut depths, mut deep) = (0, 0);
+        let mut shifts = Vec::new();
+        for (row, column) in
+            (6..114).step_by(3).flat_map(|r| (6..154).step_by(3).map(move |c| (r, c)))
+        {
+            let pixel = Point2::new(f64::from(column), f64::from(row));
+            let Some((landed, depth)) = carry(pixel) else { continue };
+            let Some(found) = law.read(&later.depth, landed) else { continue };
+            // The readings' noise, and the change of depth within half a pixel.
+            let limit = 2.0 * law.standard_deviation(depth) + 0.5 * found.slope.norm();
+            depths += 1;
+            if (found.depth - depth).abs() > limit {
+                continue;
             }
+            deep += 1;
+            let patch: Option<Vec<_>> = (-2..=2)
+                .flat_map(|y| (-2..=2).map(move |x| Vector2::new(f64::from(x), f64::from(y))))
+                .map(|offset| {
+                    Some((carry(pixel + offset)?.0, green(&first.color, pixel + offset)?))
+                })
+                .collect();
+            shifts.extend(patch.and_then(|patch| residual_shift(&later.color, &patch)));
         }
-        assert!(seen > 5000, "{seen}");
+        assert!(depths > 800, "{depths}");
         // What is hidden in one of the frames may disagree.
-        assert!(f64::from(agreeing) > 0.9 * f64::from(seen), "{agreeing} of {seen}");
-        assert!(difference[1..].iter().all(|d| *d > 1.15 * difference[0]), "{difference:?}");
+        assert!(f64::from(deep) > 0.97 * f64::from(depths), "{deep} of {depths}");
+        let mut lengths: Vec<f64> = shifts.iter().map(Vector2::norm).collect();
+        lengths.sort_by(f64::total_cmp);
+        assert!(lengths.len() > 150, "{}", lengths.len());
+        let part = |percent: usize| lengths[lengths.len() * percent / 100];
+        assert!(part(50) < 0.1 && part(95) < 0.5, "{} {}", part(50), part(95));
+        let mean = shifts.iter().sum::<Vector2<f64>>() / shifts.len() as f64;
+        assert!(mean.norm() < 0.05, "{mean}");
     }
 
     #[test]

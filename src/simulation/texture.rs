@@ -5,6 +5,8 @@
 //! scale and no repetition. Colors are coded by their square root (gamma 2): light then still
 //! multiplies, and photon noise has the same spread everywhere.
 
+use std::path::Path;
+
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
@@ -222,21 +224,57 @@ impl Area {
     }
 }
 
+/// An image file that hangs on walls and clothes boxes. Its coding is near enough to gamma 2.
+#[derive(Debug, Clone)]
+pub struct Picture {
+    width: usize,
+    height: usize,
+    pixels: Vec<[u8; 3]>,
+}
+
+impl Picture {
+    /// Reads a PNG or JPEG file.
+    pub fn load(path: &Path) -> image::ImageResult<Self> {
+        let image = image::ImageReader::open(path)?.with_guessed_format()?.decode()?.into_rgb8();
+        let (width, height) = (image.width() as usize, image.height() as usize);
+        let pixels = image.pixels().map(|pixel| pixel.0).collect();
+        Ok(Self { width, height, pixels })
+    }
+
+    /// Mean color of the part between two corners, in fractions of width and height.
+    fn mean(&self, [left, top]: [f32; 2], [right, bottom]: [f32; 2]) -> Color {
+        let range = |from: f32, to: f32, count: usize| {
+            let first = ((from * count as f32) as usize).min(count - 1);
+            first..((to * count as f32).ceil() as usize).clamp(first + 1, count)
+        };
+        let (mut sum, mut number) = ([0.0_f32; 3], 0.0);
+        for row in range(top, bottom, self.height) {
+            for column in range(left, right, self.width) {
+                let pixel = self.pixels[row * self.width + column];
+                sum.iter_mut().zip(pixel).for_each(|(s, p)| *s += f32::from(p));
+                number += 1.0;
+            }
+        }
+        sum.map(|s| s / number)
+    }
+}
+
 /// Where a surface is painted before its mip levels are made. Rows run along increasing `v`.
-struct Canvas {
+struct Canvas<'a> {
     columns: usize,
     rows: usize,
     texel: f32,
     texels: Vec<[u8; 4]>,
     clip: Area,
+    pictures: &'a [Picture],
 }
 
-impl Canvas {
+impl<'a> Canvas<'a> {
     fn new(columns: usize, rows: usize, texel: f32, color: Color) -> Self {
         let clip =
             Area { x: 0.0, y: 0.0, width: columns as f32 * texel, height: rows as f32 * texel };
         let texels = vec![pack(color); columns * rows];
-        Self { columns, rows, texel, texels, clip }
+        Self { columns, rows, texel, texels, clip, pictures: &[] }
     }
 
     fn width(&self) -> f32 {
@@ -291,6 +329,32 @@ impl Canvas {
                 } else if alpha > 0.0 {
                     blend(texel, color, alpha);
                 }
+            }
+        }
+    }
+
+    /// Fills an area with the largest part of a picture that has its proportions.
+    fn hang(&mut self, picture: &Picture, area: Area) {
+        let aspect = (area.width / area.height) * picture.height as f32 / picture.width as f32;
+        let part = [aspect.min(1.0), (1.0 / aspect).min(1.0)];
+        let margin = part.map(|p| 0.5 * (1.0 - p));
+        let cell = |start: f32, count: usize| {
+            let first = (start / self.texel).round().max(0.0) as usize;
+            first.min(count)
+        };
+        let (x0, x1) = (cell(area.x, self.columns), cell(area.x + area.width, self.columns));
+        let (y0, y1) = (cell(area.y, self.rows), cell(area.y + area.height, self.rows));
+        let at = |k: usize, axis: usize, count: usize| {
+            margin[axis] + part[axis] * k as f32 / count as f32
+        };
+        for row in y0..y1 {
+            // Rows of a canvas run upwards, those of a picture downwards.
+            let down = y1 - 1 - row;
+            for column in x0..x1 {
+                let right = column - x0;
+                let corner = [at(right, 0, x1 - x0), at(down, 1, y1 - y0)];
+                let opposite = [at(right + 1, 0, x1 - x0), at(down + 1, 1, y1 - y0)];
+                self.texels[row * self.columns + column] = pack(picture.mean(corner, opposite));
             }
         }
     }
@@ -485,7 +549,8 @@ impl Material {
     }
 }
 
-/// Paints one face of `width` by `height` metres; `richness` from 0 (bare) to 1 (busy). Texels of
+/// Paints one face of `width` by `height` metres; `richness` from 0 (bare) to 1 (busy); pictures
+/// are invented where none are given. Texels of
 /// large faces have an edge of `texel` m (more beyond 16 million of them), those of small ones down
 /// to half of it.
 pub fn paint(
@@ -493,6 +558,7 @@ pub fn paint(
     [width, height]: [f32; 2],
     texel: f32,
     richness: f32,
+    pictures: &[Picture],
     rng: &mut ChaCha8Rng,
 ) -> Texture {
     const MAX_TEXELS: f32 = 16e6;
@@ -500,7 +566,7 @@ pub fn paint(
     let texel = (side / 700.0).clamp(0.5 * texel, texel).max(side / MAX_TEXELS.sqrt());
     let columns = (width / texel).ceil().max(1.0) as usize;
     let rows = (height / texel).ceil().max(1.0) as usize;
-    let mut canvas = Canvas::new(columns, rows, texel, [128.0; 3]);
+    let mut canvas = Canvas { pictures, ..Canvas::new(columns, rows, texel, [128.0; 3]) };
     match material {
         Material::Wall => wall(&mut canvas, rng, richness),
         Material::Ceiling => ceiling(&mut canvas, rng),
@@ -596,6 +662,10 @@ fn sheet(canvas: &mut Canvas, rng: &mut ChaCha8Rng, area: Area) {
 }
 
 fn picture(canvas: &mut Canvas, rng: &mut ChaCha8Rng, area: Area) {
+    if !canvas.pictures.is_empty() {
+        let chosen = &canvas.pictures[rng.random_range(0..canvas.pictures.len())];
+        return canvas.hang(chosen, area);
+    }
     let dark = rng.random_range(10.0..80.0);
     let light = rng.random_range(180.0..255.0);
     let palette = Palette::around(rng, 7, dark, light);
@@ -782,7 +852,7 @@ mod tests {
     #[test]
     fn a_wide_footprint_reads_the_mean() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let texture = paint(Material::Print, [1.0, 1.0], 0.005, 1.0, &mut rng);
+        let texture = paint(Material::Print, [1.0, 1.0], 0.005, 1.0, &[], &mut rng);
         let level = &texture.levels[0];
         let n = level.texels.len() as f32;
         let mean = level.texels.iter().map(|t| f32::from(t[1])).sum::<f32>() / n;
@@ -793,7 +863,7 @@ mod tests {
     #[test]
     fn a_small_footprint_reads_the_texel() {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
-        let texture = paint(Material::Carton, [0.5, 0.4], 0.005, 1.0, &mut rng);
+        let texture = paint(Material::Carton, [0.5, 0.4], 0.005, 1.0, &[], &mut rng);
         let level = &texture.levels[0];
         let (column, row) = (37, 21);
         let (u, v) = ((column as f32 + 0.5) * texture.texel, (row as f32 + 0.5) * texture.texel);
@@ -814,7 +884,7 @@ mod tests {
             Material::Print,
         ] {
             let mut rng = ChaCha8Rng::seed_from_u64(9);
-            let texture = paint(material, [0.9, 0.7], 0.005, 1.0, &mut rng);
+            let texture = paint(material, [0.9, 0.7], 0.005, 1.0, &[], &mut rng);
             let level = &texture.levels[0];
             let n = level.texels.len() as f32;
             let values = || level.texels.iter().map(|t| f32::from(t[1]));
@@ -822,5 +892,34 @@ mod tests {
             let sd = (values().map(|v| (v - mean).powi(2)).sum::<f32>() / n).sqrt();
             assert!(sd > 8.0, "{material:?}: {sd}");
         }
+    }
+
+    #[test]
+    fn pictures_hang_upright_and_in_proportion() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("quarters.png");
+        // Red, green above blue, white; twice as wide as high.
+        let quarter = |x: u32, y: u32| match (x < 40, y < 20) {
+            (true, true) => image::Rgb([200, 10, 10]),
+            (false, true) => image::Rgb([10, 200, 10]),
+            (true, false) => image::Rgb([10, 10, 200]),
+            (false, false) => image::Rgb([200, 200, 200]),
+        };
+        image::RgbImage::from_fn(80, 40, quarter).save(&path).unwrap();
+        let picture = Picture::load(&path).unwrap();
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let texture = paint(Material::Print, [0.5, 0.5], 0.01, 1.0, &[picture], &mut rng);
+        let at = |u, v| texture.sample(u, v, [1e-4, 0.0], [0.0, 1e-4]);
+        for (u, v, color) in [
+            (0.12, 0.38, [200.0, 10.0, 10.0]),
+            (0.38, 0.38, [10.0, 200.0, 10.0]),
+            (0.12, 0.12, [10.0, 10.0, 200.0]),
+            (0.38, 0.12, [200.0, 200.0, 200.0]),
+        ] {
+            let seen = at(u, v);
+            let near = seen.iter().zip(color).all(|(a, b): (&f32, f32)| (a - b).abs() < 3.0);
+            assert!(near, "({u}, {v}): {seen:?} instead of {color:?}");
+        }
+        assert!(Picture::load(&folder.path().join("absent.png")).is_err());
     }
 }

@@ -1,12 +1,14 @@
 //! Rooms full of boxes, and rays through them.
 
+use std::path::PathBuf;
+
 use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::texture::{Color, Material, Texture, paint};
+use super::texture::{Color, Material, Picture, Texture, paint};
 
 /// The room and what stands in it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -24,11 +26,21 @@ pub struct RoomConfig {
     pub texel: f64,
     /// Free space kept around the path, m.
     pub clearance: f64,
+    /// Image files (PNG, JPEG) for posters, screens and printed boxes, as seen from the working
+    /// directory; none: invented ones.
+    pub images: Vec<PathBuf>,
 }
 
 impl Default for RoomConfig {
     fn default() -> Self {
-        Self { size: [7.0, 6.0, 2.8], clutter: 26, richness: 0.8, texel: 0.005, clearance: 0.7 }
+        Self {
+            size: [7.0, 6.0, 2.8],
+            clutter: 26,
+            richness: 0.8,
+            texel: 0.005,
+            clearance: 0.7,
+            images: Vec::new(),
+        }
     }
 }
 
@@ -256,11 +268,13 @@ impl Round {
 }
 
 impl World {
-    /// Builds a furnished room that leaves `path` (positions of the sensor, m) free.
+    /// Builds a furnished room that leaves `path` (positions of the sensor, m) free, with
+    /// `pictures` on its posters.
     pub fn furnished(
         room: &RoomConfig,
         people: &PeopleConfig,
         path: &[Vector3<f64>],
+        pictures: &[Picture],
         seed: u64,
     ) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -284,7 +298,7 @@ impl World {
                 let face = |face: usize| {
                     let mut rng = ChaCha8Rng::seed_from_u64(seed);
                     rng.set_stream((6 * index + face) as u64 + 1);
-                    finished_face(plan, face, room, &bare, &lamps, &mut rng)
+                    finished_face((plan, face), room, pictures, (&bare, &lamps), &mut rng)
                 };
                 Solid { faces: (0..6).map(face).collect(), ..plan.solid() }
             })
@@ -506,17 +520,16 @@ fn lamps(room: &RoomConfig) -> Vec<Vector3<f32>> {
 }
 
 fn finished_face(
-    plan: &Plan,
-    face: usize,
+    (plan, face): (&Plan, usize),
     room: &RoomConfig,
-    scene: &[Solid],
-    lamps: &[Vector3<f32>],
+    pictures: &[Picture],
+    (scene, lamps): (&[Solid], &[Vector3<f32>]),
     rng: &mut ChaCha8Rng,
 ) -> Face {
     let (axis, u, v) = face_axes(face);
     let (width, height) = (plan.size[u] as f32, plan.size[v] as f32);
     let (texel, richness) = (room.texel as f32, room.richness as f32);
-    let texture = paint(plan.material(face), [width, height], texel, richness, rng);
+    let texture = paint(plan.material(face), [width, height], texel, richness, pictures, rng);
     let solid = plan.solid();
     let outward = if face % 2 == 1 { 1.0 } else { -1.0 };
     let sign = if plan.inside_out { -outward } else { outward };
@@ -602,4 +615,57 @@ fn occluded(point: &Vector3<f32>, ray: &Vector3<f32>, scene: &[Solid]) -> bool {
         let direction = solid.world_from_box.inverse_transform_vector(ray);
         solid.hit(&origin, &direction, 0.0).is_some_and(|hit| hit.distance < 1.0)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use parry3d::query::{Ray, RayCast};
+    use parry3d::shape::Cuboid;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn vector(size: f32) -> impl Strategy<Value = Vector3<f32>> {
+        [-size..size, -size..size, -size..size].prop_map(Vector3::from)
+    }
+
+    proptest! {
+        /// The box test of this module, which is made for images, and that of a geometry library.
+        #[test]
+        fn rays_meet_boxes_where_parry_says(
+            half in vector(1.0),
+            origin in vector(4.0),
+            target in vector(1.2),
+        ) {
+            let half = half.abs().add_scalar(0.1);
+            let direction = target.component_mul(&half) - origin;
+            let solid = Solid {
+                world_from_box: Isometry3::identity(),
+                half,
+                inside_out: false,
+                faces: Vec::new(),
+            };
+            let inside = origin.abs() < half;
+            let ray = Ray::new(origin.into(), direction.into());
+            let expected = Cuboid::new(half.into()).cast_local_ray_and_get_normal(&ray, 1e3, false);
+            let solid = Solid { inside_out: inside, ..solid };
+            let found = solid.hit(&origin, &direction, 0.0);
+            match (found, expected) {
+                (Some(hit), Some(expected)) => {
+                    let tolerance = 1e-4 * (1.0 + expected.time_of_impact);
+                    prop_assert!((hit.distance - expected.time_of_impact).abs() < tolerance);
+                }
+                (None, None) => {}
+                // At an edge rounding decides.
+                (found, expected) => {
+                    let distance = found.map(|hit| hit.distance);
+                    let distance = distance.or(expected.map(|hit| hit.time_of_impact));
+                    let place = origin + direction * distance.unwrap_or_default();
+                    let beyond = (place.abs() - half).map(f32::abs);
+                    let edges = beyond.iter().filter(|x| **x < 1e-3).count();
+                    prop_assert!(edges >= 2, "{found:?} {:?}", expected.map(|h| h.time_of_impact));
+                }
+            }
+        }
+    }
 }

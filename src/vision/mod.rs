@@ -15,6 +15,7 @@ pub mod patch;
 pub mod ransac;
 #[cfg(feature = "vision")]
 mod select;
+mod stereo;
 
 pub use camera::{CameraConfig, PinholeCamera};
 pub use depth::{DepthConfig, DepthReading};
@@ -26,3 +27,4 @@ pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_g
 pub use orb::{OrbExtractor, VisionError};
 pub use patch::{Patch, PatchConfig};
 pub use ransac::{Correspondence, RansacConfig, estimate_pose};
+pub use stereo::{StereoError, StereoRig};

@@ -1,0 +1,338 @@
+//! What is in a log, and whether it is fit for visual-inertial odometry.
+//!
+//! The whole log is read, but only one image in ten is decoded.
+
+mod findings;
+mod images;
+mod inertial;
+mod timing;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use nalgebra::Isometry3;
+use serde::Serialize;
+
+use self::images::{ColorStatistics, DepthStatistics};
+use self::inertial::Inertial;
+use self::timing::Times;
+use super::folder::{Listing, read_entry};
+use super::merge::Reading;
+use super::message::{Fields, MessageType};
+use super::open::{Contents, MessageLog};
+use super::pair::{Paired, Pairer};
+use super::pixels::Rejection;
+use super::ros::{Message, Role, Survey, decode, encoding_and_size};
+use super::{LogConfig, LogError, LogSummary, ReadReport};
+use crate::inertial::{ImuConfig, Stamp};
+use crate::vision::{ColorImage, StereoRig};
+
+pub use findings::{Finding, Severity, Verdict};
+pub use images::{ColorInspection, DepthInspection};
+pub use inertial::{AccelerometerUnit, Evidence, GyroscopeUnit, ImuInspection, Sign};
+pub use timing::{Gap, LogClock, Timing};
+
+/// One image in this many is decoded.
+const STRIDE: u64 = 10;
+
+/// The settings with which the log would be replayed; what the log says differently is advised.
+#[derive(Debug, Clone)]
+pub struct Assumed<'a> {
+    pub log: &'a LogConfig,
+    pub imu: &'a ImuConfig,
+    /// Where it is known to be that of this log's camera.
+    pub body_from_camera: Option<Isometry3<f64>>,
+}
+
+/// What is in a log. Times are in seconds.
+#[derive(Debug, Clone, Serialize)]
+pub struct Inspection {
+    #[serde(flatten)]
+    pub summary: LogSummary,
+    /// From the first to the last message of the streams that are used, s.
+    pub duration: f64,
+    pub topics: BTreeMap<String, TopicInspection>,
+    pub color: Option<ColorInspection>,
+    pub depth: Option<DepthInspection>,
+    pub pairs: PairInspection,
+    pub imu: Option<ImuInspection>,
+    /// Messages that could not be used, by reason.
+    pub skipped: BTreeMap<String, u64>,
+    pub findings: Vec<Finding>,
+    pub verdict: Verdict,
+}
+
+/// One topic, or one kind of file of a folder.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct TopicInspection {
+    /// Message type, as logged.
+    pub schema: String,
+    /// Of the first image: encoding, width and height.
+    pub encoding: Option<String>,
+    pub size: Option<(u32, u32)>,
+    pub messages: u64,
+    /// Size of the messages; 0 for files.
+    pub bytes: u64,
+    /// Absent without messages.
+    pub timing: Option<Timing>,
+}
+
+/// Which color and depth images belong together.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct PairInspection {
+    pub frames: u64,
+    /// Images without a partner within `log.max_pair_difference`.
+    pub lone_color: u64,
+    pub lone_depth: u64,
+    /// Largest difference of the stamps of a pair, s.
+    pub largest_difference: f64,
+}
+
+/// Reads a log through.
+///
+/// # Errors
+/// As [`super::open`], but a log that lacks streams is no error.
+pub fn inspect(path: &Path, assumed: &Assumed) -> Result<Inspection, LogError> {
+    assumed.log.validate()?;
+    let mut inspector = Inspector::new(assumed.log);
+    let summary = match Contents::of(path, assumed.log)? {
+        Contents::Folder(summary, listing) => {
+            inspector.read_folder(listing);
+            summary
+        }
+        Contents::Messages(messages) => inspector.read_messages(path, &messages, assumed.log)?,
+    };
+    Ok(inspector.finish(summary, assumed))
+}
+
+struct Inspector {
+    topics: BTreeMap<String, (TopicInspection, Times)>,
+    roles: BTreeMap<String, Role>,
+    /// Settings that leave the values as they are logged.
+    raw: LogConfig,
+    color: ColorStatistics,
+    depth: DepthStatistics,
+    inertial: Inertial,
+    pairing: Pairer<(), Stamp>,
+    pairs: PairInspection,
+    latest_image: Option<Stamp>,
+    report: ReadReport,
+    /// Of two cameras, and the left image that waits for the right one.
+    stereo: Option<StereoRig>,
+    left: Option<(Stamp, ColorImage)>,
+}
+
+impl Inspector {
+    fn new(log: &LogConfig) -> Self {
+        let raw = LogConfig { depth_invalid: Vec::new(), ..LogConfig::default() };
+        Self {
+            topics: BTreeMap::new(),
+            roles: BTreeMap::new(),
+            raw,
+            color: ColorStatistics::default(),
+            depth: DepthStatistics::default(),
+            inertial: Inertial::default(),
+            pairing: Pairer::new((log.max_pair_difference * 1e9).round() as i64),
+            pairs: PairInspection::default(),
+            latest_image: None,
+            report: ReadReport::default(),
+            stereo: None,
+            left: None,
+        }
+    }
+
+    fn read_messages(
+        &mut self,
+        path: &Path,
+        log: &MessageLog,
+        config: &LogConfig,
+    ) -> Result<LogSummary, LogError> {
+        let survey = Survey::new(log.messages().as_mut());
+        let chosen = survey.choose(config).map_err(|role| survey.missing(path, role))?;
+        let summary = survey.summary_of(log.kind(), &chosen);
+        self.roles = chosen.into_iter().map(|(role, topic)| (topic, role)).collect();
+        let mut messages = log.messages();
+        // Topics without messages are told too.
+        for channel in messages.channels() {
+            let topic = self.topics.entry(channel.topic.clone()).or_default();
+            topic.0.schema.clone_from(&channel.schema);
+        }
+        let mut report = std::mem::take(&mut self.report);
+        while messages.visit_next(&mut report, &mut |message, report| self.visit(message, report)) {
+        }
+        self.report = report;
+        Ok(summary)
+    }
+
+    fn visit(&mut self, message: &Message, report: &mut ReadReport) {
+        let channel = message.channel;
+        let role = self.roles.get(&channel.topic).copied();
+        let stamp = header_stamp(message);
+        let (topic, times) = self.topics.entry(channel.topic.clone()).or_default();
+        topic.schema.clone_from(&channel.schema);
+        topic.messages += 1;
+        topic.bytes += message.data.len() as u64;
+        times.add(stamp, Some(message.log_time));
+        if topic.encoding.is_none()
+            && let Ok((encoding, size)) = encoding_and_size(message)
+        {
+            (topic.encoding, topic.size) = (encoding, size);
+        }
+        let (Some(role), Some(stamp)) = (role, stamp) else { return };
+        let number = topic.messages;
+        self.note_image(role, stamp);
+        if role.is_image() && number % STRIDE != 1 {
+            return;
+        }
+        let is_metres = topic_is_metres(self.topics.get(&channel.topic));
+        match decode(role, message, &self.raw, &ImuConfig::default()) {
+            Ok(reading) => self.take(reading, is_metres),
+            Err(Rejection { reason, detail }) => report.skip(
+                &format!("{}: {reason}", role.name()),
+                format_args!("{}, {}: {detail}", channel.topic, message.place),
+            ),
+        }
+    }
+
+    fn read_folder(&mut self, mut listing: Listing) {
+        listing.entries.sort_by_key(|(stamp, _)| *stamp);
+        self.stereo = listing.stereo;
+        for (reason, detail) in listing.rejections {
+            self.report.skip(&reason, detail);
+        }
+        for (stamp, entry) in &listing.entries {
+            let role = entry.role();
+            let (topic, times) = self.topics.entry(role.name().to_owned()).or_default();
+            topic.messages += 1;
+            times.add(Some(*stamp), None);
+            let number = topic.messages;
+            self.note_image(role, *stamp);
+            if role.is_image() && number % STRIDE != 1 {
+                continue;
+            }
+            match read_entry(*stamp, entry, &self.raw, &ImuConfig::default()) {
+                Ok(reading) => {
+                    if let Some((topic, _)) = self.topics.get_mut(role.name()) {
+                        topic.size = reading.image_size().or(topic.size);
+                    }
+                    self.take(reading, false);
+                }
+                Err(Rejection { reason, detail }) => {
+                    self.report.skip(&format!("{}: {reason}", role.name()), detail);
+                }
+            }
+        }
+    }
+
+    fn take(&mut self, reading: Reading, is_metres: bool) {
+        match reading {
+            Reading::Color(stamp, image) => {
+                self.color.add(&image);
+                self.left = self.stereo.is_some().then_some((stamp, image));
+            }
+            Reading::Right(stamp, right) => {
+                let left = self.left.take().filter(|(left, _)| *left == stamp);
+                if let (Some(rig), Some((_, left))) = (&self.stereo, left)
+                    && let Some((_, depth)) = rig.measure(&left, &right)
+                {
+                    self.depth.add(&depth, true);
+                }
+            }
+            Reading::Depth(_, image) => self.depth.add(&image, is_metres),
+            Reading::Imu(sample) => self.inertial.add_sample(sample),
+            Reading::Truth(pose) => self.inertial.add_truth(pose),
+        }
+    }
+
+    fn note_image(&mut self, role: Role, stamp: Stamp) {
+        /// Images may come this much out of order, s.
+        const DISORDER: f64 = 5.0;
+        match role {
+            Role::Color => self.pairing.add_color(stamp, ()),
+            Role::Depth | Role::Right => self.pairing.add_depth(stamp, stamp),
+            Role::Imu | Role::Truth => return,
+        };
+        self.latest_image = self.latest_image.max(Some(stamp));
+        if let Some(latest) = self.latest_image {
+            self.settle(latest.offset_by(-DISORDER));
+        }
+    }
+
+    fn settle(&mut self, until: Stamp) {
+        let pairs = &mut self.pairs;
+        self.pairing.settle(until, |paired| match paired {
+            Paired::Pair(color, (), depth) => {
+                pairs.frames += 1;
+                let difference = depth.seconds_since(color).abs();
+                pairs.largest_difference = pairs.largest_difference.max(difference);
+            }
+            Paired::LoneColor(..) => pairs.lone_color += 1,
+            Paired::LoneDepth(..) => pairs.lone_depth += 1,
+        });
+    }
+
+    fn finish(mut self, summary: LogSummary, assumed: &Assumed) -> Inspection {
+        self.settle(Stamp::from_nanos(i64::MAX));
+        let topics: BTreeMap<String, TopicInspection> = self
+            .topics
+            .into_iter()
+            .map(|(name, (topic, times))| {
+                (name, TopicInspection { timing: times.evaluate(), ..topic })
+            })
+            .collect();
+        let used = |name: &String| self.roles.is_empty() || self.roles.contains_key(name);
+        let timings = || {
+            topics
+                .iter()
+                .filter(|(name, _)| used(name))
+                .filter_map(|(_, topic)| topic.timing.as_ref())
+        };
+        let first = timings().map(|timing| timing.first).fold(f64::INFINITY, f64::min);
+        let last = timings().map(|timing| timing.last).fold(f64::NEG_INFINITY, f64::max);
+        let mut inspection = Inspection {
+            summary,
+            duration: (last - first).max(0.0),
+            topics,
+            color: self.color.evaluate(),
+            depth: self.depth.evaluate(),
+            pairs: self.pairs,
+            imu: self.inertial.evaluate(assumed.body_from_camera.as_ref()),
+            skipped: self.report.skipped,
+            findings: Vec::new(),
+            verdict: Verdict::default(),
+        };
+        (inspection.findings, inspection.verdict) = findings::judge(&inspection, assumed);
+        inspection
+    }
+}
+
+impl Inspection {
+    /// What is known of the topic or list that plays a role (`color`, `depth`, `imu`, `truth`).
+    pub fn topic(&self, role: &str) -> Option<&TopicInspection> {
+        let source = self.summary.sources.get(role)?;
+        // The files of a folder are told by their role.
+        self.topics.get(source).or_else(|| self.topics.get(folder_topic(role)))
+    }
+}
+
+fn folder_topic(role: &str) -> &str {
+    match role {
+        "color" => Role::Color.name(),
+        "depth" => Role::Depth.name(),
+        "right" => Role::Right.name(),
+        other => other,
+    }
+}
+
+fn topic_is_metres(topic: Option<&(TopicInspection, Times)>) -> bool {
+    topic.is_some_and(|(topic, _)| topic.encoding.as_deref() == Some("32FC1"))
+}
+
+/// Of a message whose type begins with a header.
+fn header_stamp(message: &Message) -> Option<Stamp> {
+    let (kind, serialization) = message.channel.readable()?;
+    if kind == MessageType::Transforms {
+        return None;
+    }
+    Fields::new(message.data, serialization).ok()?.header().ok()
+}
