@@ -22,9 +22,11 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag1 import Reader, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORE = get_typestore(Stores.ROS1_NOETIC)
+STORE.register(get_types_from_msg(
+    "geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 SCENE = """
 duration = 1.0
 start_time = 5645.18

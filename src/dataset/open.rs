@@ -147,11 +147,13 @@ impl Contents {
 
 #[cfg(test)]
 mod tests {
+    use std::ops::ControlFlow;
     use std::path::PathBuf;
 
     use super::super::samples::{self, Sample, read_all};
-    use super::super::{Event, RgbdFrame};
+    use super::super::{Assumed, Event, RgbdFrame, convert, inspect};
     use super::*;
+    use crate::vision::CameraConfig;
 
     fn open_default(path: &Path) -> Result<Box<dyn Log>, LogError> {
         open(path, &LogConfig::default(), &ImuConfig::default())
@@ -320,6 +322,12 @@ mod tests {
                 if let Ok(mut log) = open_default(&path) {
                     assert!(read_all(log.as_mut()).len() <= samples.len());
                 }
+                let (log, imu) = (LogConfig::default(), ImuConfig::default());
+                let assumed = Assumed { log: &log, imu: &imu, body_from_camera: None };
+                let _ = inspect(&path, &assumed);
+                let output = path.with_extension("mcap");
+                let go_on = || ControlFlow::Continue(());
+                let _ = convert(&path, &output, &log, &CameraConfig::default(), go_on);
             }
         }
     }
