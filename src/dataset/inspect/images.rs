@@ -10,6 +10,9 @@ const DARK: f64 = 12.0;
 /// Raw depths above this are no millimetres: RGB-D sensors do not see beyond 20 m.
 const LARGEST_MILLIMETRES: usize = 20_000;
 
+/// Nor is a median above this: most of what such sensors see is nearer than 4 m.
+const LARGEST_MEDIAN_MILLIMETRES: usize = 4_000;
+
 /// If more than this part of the depths are multiples of five, they were scaled by five from
 /// millimetres, as TUM RGB-D does.
 const SHARE_OF_FIVES: f64 = 0.9;
@@ -128,7 +131,8 @@ impl DepthStatistics {
         };
         let (median, p99) = (quantile(0.5).unwrap_or(0), quantile(0.99).unwrap_or(0));
         let fives: u64 = (5..65535).step_by(5).map(|raw| self.counts[raw]).sum();
-        let scaled = p99 > LARGEST_MILLIMETRES || fives as f64 > SHARE_OF_FIVES * valid as f64;
+        let too_far = p99 > LARGEST_MILLIMETRES || median > LARGEST_MEDIAN_MILLIMETRES;
+        let scaled = too_far || fives as f64 > SHARE_OF_FIVES * valid as f64;
         let scale = if scaled && valid > 0 && !self.was_metres { 0.0002 } else { 0.001 };
         Some(DepthInspection {
             images: self.images,
