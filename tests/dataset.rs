@@ -86,6 +86,10 @@ fn a_folder_becomes_a_log_that_is_replayed_like_it() {
                     };
                 assert!((0..480).flat_map(|y| (0..640).map(move |x| (x, y))).all(agree));
             }
+            (Event::Truth(before), Event::Truth(after)) => {
+                let moved = before.world_from_body.inv_mul(&after.world_from_body);
+                assert!(moved.translation.vector.norm() < 1e-12 && moved.rotation.angle() < 1e-7);
+            }
             (before, after) => assert_eq!(before, after),
         }
     }

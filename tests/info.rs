@@ -94,7 +94,7 @@ fn the_traps_of_vcu_rvi_are_found() {
 #[test]
 fn a_log_in_order_is_fit_as_it_is() {
     let folder = tempfile::tempdir().unwrap();
-    let log = simulated(folder.path(), "duration = 3.0");
+    let log = simulated(folder.path(), "duration = 6.0");
     let found = info(&log, &[]);
     assert_eq!(found["verdict"]["text"], "fit for VIO");
     assert_eq!(found["imu"]["accelerometer_unit"], "m/s^2");
@@ -103,7 +103,7 @@ fn a_log_in_order_is_fit_as_it_is() {
     assert_eq!(found["imu"]["at_rest"], true);
     let up = found["imu"]["truth_up"][2].as_f64().unwrap();
     assert!(up > 0.999, "{up}");
-    assert_eq!(found["pairs"]["frames"], 91);
+    assert_eq!(found["pairs"]["frames"], 181);
     let rate = found["topics"]["/imu"]["timing"]["rate"].as_f64().unwrap();
     assert!((rate - 200.0).abs() < 0.01, "{rate}");
     let severe = |f: &&Value| f["severity"] == "warning" || f["severity"] == "error";

@@ -25,7 +25,7 @@ pub(super) trait ReadingSource: Send {
 }
 
 impl Reading {
-    fn stamp(&self) -> Stamp {
+    pub fn stamp(&self) -> Stamp {
         match self {
             Self::Color(stamp, _) | Self::Right(stamp, _) | Self::Depth(stamp, _) => *stamp,
             Self::Imu(sample) => sample.stamp,

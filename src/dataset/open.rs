@@ -65,16 +65,18 @@ pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log
     log.validate()?;
     Ok(match Contents::of(path, log)? {
         Contents::Folder(summary, listing) => {
-            // The entries are sorted already.
-            let sorted = LogConfig { reorder_window: 0.0, ..log.clone() };
             let stereo = listing.stereo.clone();
             let source = FolderSource::new(listing, log, imu);
             match stereo {
                 Some(rig) => {
                     let source = StereoSource::new(source, rig, log);
+                    Box::new(MergedLog::new(source, summary, log))
+                }
+                None => {
+                    // The entries are sorted already.
+                    let sorted = LogConfig { reorder_window: 0.0, ..log.clone() };
                     Box::new(MergedLog::new(source, summary, &sorted))
                 }
-                None => Box::new(MergedLog::new(source, summary, &sorted)),
             }
         }
         Contents::Messages(messages) => {

@@ -66,14 +66,18 @@ impl<S: ReadingSource> ReadingSource for StereoSource<S> {
             if self.is_over {
                 return None;
             }
-            let (stamp, is_new) = match self.source.next_reading(report) {
-                Some(Reading::Color(stamp, left)) => (stamp, self.pairs.add_color(stamp, left)),
-                Some(Reading::Right(stamp, right)) => (stamp, self.pairs.add_depth(stamp, right)),
-                Some(other) => return Some(other),
-                None => {
-                    self.is_over = true;
-                    self.settle(Stamp::from_nanos(i64::MAX), report);
-                    continue;
+            let Some(reading) = self.source.next_reading(report) else {
+                self.is_over = true;
+                self.settle(Stamp::from_nanos(i64::MAX), report);
+                continue;
+            };
+            let stamp = reading.stamp();
+            let is_new = match reading {
+                Reading::Color(stamp, left) => self.pairs.add_color(stamp, left),
+                Reading::Right(stamp, right) => self.pairs.add_depth(stamp, right),
+                other => {
+                    self.ready.push_back(other);
+                    true
                 }
             };
             if !is_new {

@@ -439,7 +439,7 @@ mod tests {
         let options = LogWriterOptions { log_time_offset: -20.0, ..LogWriterOptions::default() };
         let mut log = LogWriter::create(&folder.path().join("log.mcap"), options).unwrap();
         let error = log.frame(&frame()).unwrap_err().to_string();
-        assert!(error.contains("log.mcap") && error.contains("-8.000"), "{error}");
+        assert!(error.contains("log.mcap") && error.contains("-7.999"), "{error}");
     }
 
     #[test]
