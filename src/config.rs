@@ -92,7 +92,7 @@ impl Config {
         let text = toml::to_string(&Self { camera, ..shipped }).map_err(|error| {
             ConfigError::Syntax { origin: origin.clone(), message: error.to_string() }
         })?;
-        Self::parse(&text, &origin, overrides)
+        parse(&text, &origin, overrides)
     }
 
     /// Reads `path` and applies `overrides` (`section.key=value`).
