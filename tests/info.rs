@@ -150,7 +150,7 @@ fn a_cut_log_is_told_to_be_cut() {
     let whole = std::fs::read(&log).unwrap();
     std::fs::write(&log, &whole[..whole.len() / 2]).unwrap();
     let found = info(&log, &[]);
-    assert!(findings(&found, "log", "cut short").len() >= 1, "{found:#}");
+    assert!(!findings(&found, "log", "cut short").is_empty(), "{found:#}");
     assert!(found["pairs"]["frames"].as_u64().unwrap() > 5);
 }
 

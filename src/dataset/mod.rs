@@ -1,8 +1,8 @@
 //! Logs in and out. Every reader yields the same time-ordered [`Event`]s behind [`Log`].
 //!
-//! [`open`] guesses the format. Containers ([`bag`], [`mcap_file`]) yield messages, [`ros`] makes
-//! readings of them, folders ([`tum`], [`seven_scenes`]) yield readings directly, and [`merge`]
-//! orders and pairs the readings. A log that is cut or damaged yields all that can still be read.
+//! [`open`] guesses the format. Containers ([`bag`] and [`mcap_file`], both read as [`records`])
+//! yield messages, [`ros`] makes readings of them, folders ([`tum`], [`euroc`], [`seven_scenes`])
+//! yield readings directly, and [`merge`] orders and pairs the readings. A log that is cut or damaged yields all that can still be read.
 
 mod bag;
 mod convert;

@@ -16,7 +16,7 @@ use crate::inertial::ImuConfig;
 
 /// What a path turned out to be.
 pub(super) enum Contents {
-    Folder(LogSummary, Listing),
+    Folder(Box<(LogSummary, Listing)>),
     Messages(MessageLog),
 }
 
@@ -64,7 +64,8 @@ impl MessageLog {
 pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log>, LogError> {
     log.validate()?;
     Ok(match Contents::of(path, log)? {
-        Contents::Folder(summary, listing) => {
+        Contents::Folder(folder) => {
+            let (summary, listing) = *folder;
             let stereo = listing.stereo.clone();
             let source = FolderSource::new(listing, log, imu);
             match stereo {
@@ -97,7 +98,7 @@ pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log
 /// folder lacks its image lists, [`LogError::Io`] if it cannot be read.
 pub fn detect(path: &Path) -> Result<LogSummary, LogError> {
     Ok(match Contents::of(path, &LogConfig::default())? {
-        Contents::Folder(summary, _) => summary,
+        Contents::Folder(folder) => folder.0,
         Contents::Messages(messages) => {
             Survey::new(messages.messages().as_mut()).summary(messages.kind())
         }
@@ -110,7 +111,7 @@ impl Contents {
         let failed = |source| LogError::Io { path: path.to_path_buf(), source };
         let unknown =
             |reason: String| Err(LogError::UnknownFormat { path: path.to_path_buf(), reason });
-        let folder = |(summary, listing)| Self::Folder(summary, listing);
+        let folder = |contents| Self::Folder(Box::new(contents));
         let messages =
             |format| LogFile::open(path).map(|file| Self::Messages(MessageLog { file, format }));
         if std::fs::metadata(path).map_err(failed)?.is_dir() {

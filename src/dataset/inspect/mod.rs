@@ -96,7 +96,8 @@ pub fn inspect(path: &Path, assumed: &Assumed) -> Result<Inspection, LogError> {
     assumed.log.validate()?;
     let mut inspector = Inspector::new(assumed.log);
     let summary = match Contents::of(path, assumed.log)? {
-        Contents::Folder(summary, listing) => {
+        Contents::Folder(folder) => {
+            let (summary, listing) = *folder;
             inspector.read_folder(listing);
             summary
         }
