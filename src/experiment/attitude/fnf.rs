@@ -10,7 +10,7 @@ use super::super::{
     Observation, PaperValue, Report, Request, Study, StudyError, Trial, monte_carlo,
 };
 use super::scene::{GyroNoise, Measured, Motion, Scene, diagonal, normal, pendulum, simulate};
-use super::{Quantities, run_filter, run_memoryless};
+use super::{Case, Quantities, run_memoryless};
 use crate::distribution::matrix_fisher::{MatrixFisher, SubsetConcentration};
 use crate::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
 use crate::filter::{AttitudeMeasurement, FilterError, Frame, VectorMeasurement};
@@ -140,15 +140,14 @@ fn gyro_noise() -> GyroNoise {
 
 fn run_all(
     trial: &mut Trial,
-    case: &'static str,
-    prior: &AttitudePrior,
+    label: &'static str,
+    prior: AttitudePrior,
     scene: &Scene,
 ) -> Result<(), FilterError> {
     let gyro = GyroModel::isotropic(GYRO_NOISE, 0.0);
-    for kind in KINDS {
-        run_filter(trial, case, kind, kind.name(), &gyro, prior, scene, Quantities::default())?;
-    }
-    run_memoryless(trial, case, scene)
+    let case = Case { label, gyro, prior, scene, quantities: Quantities::default() };
+    case.run(trial, &KINDS)?;
+    run_memoryless(trial, label, scene)
 }
 
 /// A case of tables III and IV.
@@ -171,7 +170,7 @@ fn vector_trial(
             three_vectors(truth, &covariance, rng)
         });
         let prior = AttitudePrior::matrix_fisher(&case.prior)?;
-        run_all(&mut trial, case.label, &prior, &scene)?;
+        run_all(&mut trial, case.label, prior, &scene)?;
     }
     Ok(trial)
 }
@@ -255,8 +254,8 @@ fn table_5(request: &Request) -> Result<Report, StudyError> {
             Measured::attitude(AttitudeMeasurement { world_from_body, ..matched })
         });
         let prior = AttitudePrior::matrix_fisher(&prior)?;
-        run_all(&mut trial, "i", &prior, &fisher)?;
-        run_all(&mut trial, "ii", &prior, &gaussian)?;
+        run_all(&mut trial, "i", prior, &fisher)?;
+        run_all(&mut trial, "ii", prior, &gaussian)?;
         Ok(trial)
     };
     let trials = monte_carlo(request, trial)?;

@@ -8,7 +8,7 @@ use rand_distr::Distribution;
 
 use super::super::{PaperValue, Report, Request, Study, StudyError, Trial, monte_carlo};
 use super::scene::{GyroNoise, Measured, diagonal, pendulum, simulate};
-use super::{Quantities, run_filter, run_memoryless};
+use super::{Case, Quantities, run_memoryless};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
 use crate::filter::{AttitudeMeasurement, FilterError, Frame};
@@ -76,10 +76,8 @@ impl Pendulum {
             let prior = AttitudePrior::matrix_fisher(&self.prior)?;
             let quantities = Quantities { settling: self.settling, ..Quantities::default() };
             let mut trial = Trial::default();
-            for &kind in self.kinds {
-                let name = kind.name();
-                run_filter(&mut trial, CASE, kind, name, &gyro, &prior, &scene, quantities)?;
-            }
+            let case = Case { label: CASE, gyro, prior, scene: &scene, quantities };
+            case.run(&mut trial, self.kinds)?;
             run_memoryless(&mut trial, CASE, &scene)?;
             Ok(trial)
         };

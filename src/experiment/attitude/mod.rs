@@ -34,47 +34,63 @@ struct Quantities {
     settling: usize,
 }
 
-/// Runs `kind` over the scene and appends its figures to the trial under the name `filter`.
-#[allow(clippy::too_many_arguments)]
-fn run_filter(
-    trial: &mut Trial,
-    case: &'static str,
-    kind: AttitudeFilterKind,
-    filter: &'static str,
-    gyro: &GyroModel,
-    prior: &AttitudePrior,
-    scene: &Scene,
+/// A column of a table: one scene and what all filters know of it.
+struct Case<'a> {
+    label: &'static str,
+    gyro: GyroModel,
+    prior: AttitudePrior,
+    scene: &'a Scene,
     quantities: Quantities,
-) -> Result<(), FilterError> {
-    let mut running = kind.start(gyro, prior)?;
-    let log = follow(running.as_mut(), scene)?;
-    let mut push = |quantity, value| {
-        trial.observations.push(Observation { case, filter, quantity, value });
-    };
-    let counted = || scene.truth.iter().zip(&log.attitudes).skip(quantities.settling);
-    push("attitude_deg", mean(counted().map(|(truth, found)| angle(truth, found).to_degrees())));
-    if let Some((frame, direction)) = quantities.partial {
-        let seen = |r: &Rotation3<f64>| match frame {
-            Frame::World => r.inverse() * direction,
-            Frame::Body => r * direction,
+}
+
+impl Case<'_> {
+    /// Runs each kind over the scene and appends its figures to the trial.
+    fn run(&self, trial: &mut Trial, kinds: &[AttitudeFilterKind]) -> Result<(), FilterError> {
+        kinds.iter().try_for_each(|&kind| self.run_as(trial, kind, kind.name()))
+    }
+
+    /// The same for one kind under another name.
+    fn run_as(
+        &self,
+        trial: &mut Trial,
+        kind: AttitudeFilterKind,
+        filter: &'static str,
+    ) -> Result<(), FilterError> {
+        let Case { label: case, ref gyro, ref prior, scene, quantities } = *self;
+        let mut running = kind.start(gyro, prior)?;
+        let log = follow(running.as_mut(), scene)?;
+        let mut push = |quantity, value| {
+            trial.observations.push(Observation { case, filter, quantity, value });
         };
-        let errors = counted().map(|(truth, found)| {
-            let (a, b) = (seen(truth), seen(found));
-            a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()
-        });
-        push("partial_attitude_deg", mean(errors));
+        let counted = || scene.truth.iter().zip(&log.attitudes).skip(quantities.settling);
+        push(
+            "attitude_deg",
+            mean(counted().map(|(truth, found)| angle(truth, found).to_degrees())),
+        );
+        if let Some((frame, direction)) = quantities.partial {
+            let seen = |r: &Rotation3<f64>| match frame {
+                Frame::World => r.inverse() * direction,
+                Frame::Body => r * direction,
+            };
+            let errors = counted().map(|(truth, found)| {
+                let (a, b) = (seen(truth), seen(found));
+                a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()
+            });
+            push("partial_attitude_deg", mean(errors));
+        }
+        if quantities.bias && kind.has_bias() {
+            let errors =
+                scene.bias.iter().zip(&log.biases).map(|(a, b)| (a - b).norm().to_degrees());
+            push("gyro_bias_deg_s", mean(errors));
+        }
+        push("nees_attitude", mean(log.attitude_nees.iter().copied()));
+        if quantities.bias && kind.has_bias() {
+            push("nees_gyro_bias", mean(log.bias_nees.iter().copied()));
+        }
+        let nanoseconds = log.seconds * 1e9 / scene.steps.len() as f64;
+        trial.step_times.push(StepTime { case, filter, nanoseconds });
+        Ok(())
     }
-    if quantities.bias && kind.has_bias() {
-        let errors = scene.bias.iter().zip(&log.biases).map(|(a, b)| (a - b).norm().to_degrees());
-        push("gyro_bias_deg_s", mean(errors));
-    }
-    push("nees_attitude", mean(log.attitude_nees.iter().copied()));
-    if quantities.bias && kind.has_bias() {
-        push("nees_gyro_bias", mean(log.bias_nees.iter().copied()));
-    }
-    let nanoseconds = log.seconds * 1e9 / scene.steps.len() as f64;
-    trial.step_times.push(StepTime { case, filter, nanoseconds });
-    Ok(())
 }
 
 /// The mean error of attitudes solved from the measurements of one instant each.

@@ -8,7 +8,7 @@ use rand_distr::Distribution;
 
 use super::super::{PaperValue, Report, Request, Study, StudyError, Trial, monte_carlo};
 use super::scene::{GyroNoise, Measured, Motion, normal, simulate, tumbling};
-use super::{Quantities, run_filter};
+use super::{Case, Quantities};
 use crate::distribution::VonMisesFisher;
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
@@ -122,19 +122,18 @@ fn table_4_2(request: &Request) -> Result<Report, StudyError> {
                 }
             }
             let gyro = GyroModel { frame: rate, ..GyroModel::isotropic(GYRO_NOISE, 0.0) };
-            let mut prior = AttitudePrior::matrix_fisher(&Matrix3::zeros())?;
+            let prior = AttitudePrior::matrix_fisher(&Matrix3::zeros())?;
             let quantities = Quantities {
                 partial: (rate != reference).then_some((reference, Vector3::x())),
                 ..Quantities::default()
             };
-            let kind = AttitudeFilterKind::BfMfd;
-            run_filter(&mut trial, case, kind, kind.name(), &gyro, &prior, &scene, quantities)?;
+            let mut column = Case { label: case, gyro, prior, scene: &scene, quantities };
+            column.run(&mut trial, &[AttitudeFilterKind::BfMfd])?;
             // Half a turn about the reference, and next to no confidence.
-            prior.attitude =
+            column.prior.attitude =
                 MatrixFisher::new(&(1e-9 * exp(&Vector3::new(PI, 0.0, 0.0)).matrix()))?;
-            prior.rotation_covariance = Some(Matrix3::from_diagonal_element(1e10));
-            let kind = AttitudeFilterKind::IekfL;
-            run_filter(&mut trial, case, kind, "mekf", &gyro, &prior, &scene, quantities)?;
+            column.prior.rotation_covariance = Some(Matrix3::from_diagonal_element(1e10));
+            column.run_as(&mut trial, AttitudeFilterKind::IekfL, "mekf")?;
         }
         Ok(trial)
     };
@@ -233,10 +232,7 @@ fn table_4_6(request: &Request) -> Result<Report, StudyError> {
             };
             let gyro = GyroModel::isotropic(GYRO_NOISE, BIAS_WALK);
             let quantities = Quantities { bias: true, ..Quantities::default() };
-            for kind in KINDS {
-                let name = kind.name();
-                run_filter(&mut trial, case, kind, name, &gyro, &prior, &scene, quantities)?;
-            }
+            Case { label: case, gyro, prior, scene: &scene, quantities }.run(&mut trial, &KINDS)?;
         }
         Ok(trial)
     };
@@ -396,10 +392,8 @@ fn table_4_7(request: &Request) -> Result<Report, StudyError> {
             });
             let partial = row.partial.map(|_| (Frame::World, Vector3::y()));
             let quantities = Quantities { partial, bias: true, settling: 0 };
-            for kind in KINDS_4_7 {
-                let (case, name) = (row.case, kind.name());
-                run_filter(&mut trial, case, kind, name, &gyro, &prior, &scene, quantities)?;
-            }
+            let label = row.case;
+            Case { label, gyro, prior, scene: &scene, quantities }.run(&mut trial, &KINDS_4_7)?;
         }
         Ok(trial)
     };
