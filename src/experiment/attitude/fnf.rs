@@ -9,7 +9,9 @@ use rand_distr::Distribution;
 use super::super::{
     Observation, PaperValue, Report, Request, Study, StudyError, Trial, monte_carlo,
 };
-use super::scene::{GyroNoise, Measured, Motion, Scene, diagonal, normal, pendulum, simulate};
+use super::scene::{
+    GyroNoise, Measured, Motion, Sampling, Scene, diagonal, normal, pendulum, simulate,
+};
 use super::{Case, Quantities, run_memoryless};
 use crate::distribution::matrix_fisher::{MatrixFisher, SubsetConcentration};
 use crate::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
@@ -51,6 +53,9 @@ const KINDS: [AttitudeFilterKind; 6] = [
 const GYRO_NOISE: f64 = PI / 180.0;
 const INTERVAL: f64 = 0.02;
 const STEPS: usize = 3000;
+/// The gyroscope of the paper reads the rate of an instant, `w_k` in (13): with the mean rate of
+/// each interval every filter is better by more than a degree, and none of the columns is met.
+const SAMPLING: Sampling = Sampling::End;
 /// Gyroscope intervals between two measurements.
 const EVERY: usize = 5;
 
@@ -176,7 +181,9 @@ fn vector_trial(
 }
 
 const SCENE_NOTE: &str = "The paper names neither the reference vectors nor whether the printed \
-    noise is a variance: its memoryless error fits e1, e2, e3 and variances.";
+    noise is a variance: its memoryless error fits e1, e2, e3 and variances. \
+    The gyroscope samples the rate at the end of each interval, which the filters do not model: \
+    NEES is above 3 for all of them.";
 const EQUAL_NOTE: &str = "fnf-r and fnf-l are the same filter in two coordinates; the paper's \
     two columns differ by more than the noise.";
 
@@ -190,7 +197,7 @@ fn table_3(request: &Request) -> Result<Report, StudyError> {
         errors("wahba", [("i", 34.1559), ("ii", 13.0605)]),
     ]
     .concat();
-    let motion = pendulum(INTERVAL, STEPS);
+    let motion = pendulum(INTERVAL, STEPS, SAMPLING);
     let prior = 10.0 * exp(&Vector3::new(PI / 18.0, 0.0, 0.0)).matrix();
     let cases = [("i", 0.24), ("ii", 0.04)].map(|(label, variance)| VectorCase {
         label,
@@ -213,7 +220,7 @@ fn table_4(request: &Request) -> Result<Report, StudyError> {
         errors("wahba", [("i", 34.1242), ("ii", 13.0266), ("iii", 20.6025)]),
     ]
     .concat();
-    let motion = pendulum(INTERVAL, STEPS);
+    let motion = pendulum(INTERVAL, STEPS, SAMPLING);
     let opposite = exp(&Vector3::new(PI, 0.0, 0.0)).into_inner();
     let cases = [
         VectorCase { label: "i", covariance: [0.24; 3], prior: 1e-3 * opposite },
@@ -236,7 +243,7 @@ fn table_5(request: &Request) -> Result<Report, StudyError> {
         errors("wahba", [("i", 90.6634), ("ii", 90.9054)]),
     ]
     .concat();
-    let motion = pendulum(INTERVAL, STEPS);
+    let motion = pendulum(INTERVAL, STEPS, SAMPLING);
     let prior = 10.0 * exp(&Vector3::new(PI / 18.0, 0.0, 0.0)).matrix();
     let noise = diagonal([100.0, 0.0, 0.0]);
     let covariance = diagonal([10.0, 0.01, 0.01]);

@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::Distribution;
 
 use super::super::{PaperValue, Report, Request, Study, StudyError, Trial, monte_carlo};
-use super::scene::{GyroNoise, Measured, diagonal, pendulum, simulate};
+use super::scene::{GyroNoise, Measured, Sampling, diagonal, pendulum, simulate};
 use super::{Case, Quantities, run_memoryless};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
@@ -58,7 +58,7 @@ impl Pendulum {
         request: &Request,
         paper: &[PaperValue],
     ) -> Result<Report, StudyError> {
-        let motion = pendulum(INTERVAL, self.steps);
+        let motion = pendulum(INTERVAL, self.steps, Sampling::Mean);
         let noise = diagonal([40.0, 50.0, 35.0]);
         let trial = |rng: &mut ChaCha8Rng| -> Result<Trial, FilterError> {
             let sampler = MatrixFisher::new(&noise)?.sampler();

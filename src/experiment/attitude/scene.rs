@@ -48,6 +48,15 @@ pub(super) struct Motion {
     pub rates: Vec<Vector3<f64>>,
 }
 
+/// When a gyroscope reads.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Sampling {
+    /// It integrates over the interval.
+    Mean,
+    /// It samples the angular velocity at the end of the interval.
+    End,
+}
+
 impl Motion {
     /// The motion `attitude(t)`; the gyroscope integrates over each interval.
     pub fn of(interval: f64, count: usize, attitude: impl Fn(f64) -> Rotation3<f64>) -> Self {
@@ -100,7 +109,7 @@ pub(super) fn normal<R: Rng>(rng: &mut R) -> Vector3<f64> {
 
 /// The 3D pendulum of Lee, Chaturvedi, Sanyal, Leok and McClamroch (2007), the motion of L-UAE,
 /// L-AMF and FNF: an elliptic cylinder of 1 kg that hangs from a pivot 0.3 m off its centre.
-pub(super) fn pendulum(interval: f64, count: usize) -> Motion {
+pub(super) fn pendulum(interval: f64, count: usize, sampling: Sampling) -> Motion {
     const INERTIA: [f64; 3] = [0.13, 0.28, 0.17];
     const MASS: f64 = 1.0;
     const ARM: f64 = 0.3;
@@ -115,7 +124,7 @@ pub(super) fn pendulum(interval: f64, count: usize) -> Motion {
     };
     let (mut r, mut w) = (Rotation3::identity(), Vector3::repeat(4.14));
     let h = interval / SUBSTEPS as f64;
-    let mut attitudes = vec![r];
+    let (mut attitudes, mut samples) = (vec![r], Vec::new());
     for _ in 0..count {
         for _ in 0..SUBSTEPS {
             // The midpoint rule on the group: of second order, 1e-7 rad a step.
@@ -126,8 +135,12 @@ pub(super) fn pendulum(interval: f64, count: usize) -> Motion {
             w = next;
         }
         attitudes.push(r);
+        samples.push(w);
     }
-    let rates = mean_rates(&attitudes, interval);
+    let rates = match sampling {
+        Sampling::Mean => mean_rates(&attitudes, interval),
+        Sampling::End => samples,
+    };
     Motion { interval, attitudes, rates }
 }
 

@@ -41,8 +41,27 @@ pub struct BayesFisher {
     map: MomentMap,
     gyro: GyroModel,
     mean: PolarMean,
-    /// Singular values at the last measurement, where the next inversion starts.
+    /// The parameter at the last measurement, where the next inversion starts.
+    last: Concentrations,
+}
+
+/// Singular values with the complements `1 - E[Q_ii]` that belong to them.
+#[derive(Debug, Clone, Copy)]
+struct Concentrations {
     s: Vector3<f64>,
+    g: Vector3<f64>,
+}
+
+impl Concentrations {
+    /// The singular values for the complements `g`, to leading order: the sums `s_j + s_k` are
+    /// close to inversely proportional to the mean squares of the quaternion.
+    fn predicted(&self, g: &Vector3<f64>) -> Vector3<f64> {
+        let opposite = |v: &Vector3<f64>| v.map(|x| v.sum() - 2.0 * x);
+        let sums = self.s.map(|s| self.s.sum() - s);
+        let sums = sums.component_mul(&opposite(&self.g)).component_div(&opposite(g));
+        let s = 0.5 * opposite(&sums);
+        if s.iter().all(|s| s.is_finite()) { s } else { self.s }
+    }
 }
 
 impl BayesFisher {
@@ -52,28 +71,27 @@ impl BayesFisher {
         gyro: &GyroModel,
         prior: &MatrixFisher,
     ) -> Result<Self, FilterError> {
-        let svd = *prior.svd();
-        Ok(Self { map, gyro: *gyro, mean: map.mean(&svd)?, s: svd.s })
+        let (mean, last) = map.mean(prior.svd())?;
+        Ok(Self { map, gyro: *gyro, mean, last })
     }
 
     /// The belief as a distribution.
     pub fn belief(&self) -> Result<MatrixFisher, FilterError> {
-        let svd = self.map.parameter(&self.mean, &self.s)?;
+        let svd = self.map.parameter(&self.mean, &self.last)?;
         Ok(MatrixFisher::from_svd(svd).map_err(MatrixFisherError::from)?)
     }
 
     /// `F + added`.
     fn fuse(&mut self, added: &Matrix3<f64>) -> Result<(), FilterError> {
-        let prior = self.map.parameter(&self.mean, &self.s)?;
+        let prior = self.map.parameter(&self.mean, &self.last)?;
         let posterior = proper_svd(&(prior.matrix() + added))?;
-        self.mean = self.map.mean(&posterior)?;
-        self.s = posterior.s;
+        (self.mean, self.last) = self.map.mean(&posterior)?;
         Ok(())
     }
 }
 
 impl MomentMap {
-    fn mean(self, fisher: &ProperSvd) -> Result<PolarMean, FilterError> {
+    fn mean(self, fisher: &ProperSvd) -> Result<(PolarMean, Concentrations), FilterError> {
         let g = match self {
             Self::Exact | Self::Approximate => {
                 first_complement(&fisher.s).map_err(MatrixFisherError::from)?
@@ -86,10 +104,11 @@ impl MomentMap {
                 centred.diagonal().map(|d| 1.0 - d)
             }
         };
-        Ok(PolarMean::from_principal(&fisher.u, &g, &fisher.v))
+        let mean = PolarMean::from_principal(&fisher.u, &g, &fisher.v);
+        Ok((mean, Concentrations { s: fisher.s, g }))
     }
 
-    fn parameter(self, mean: &PolarMean, near: &Vector3<f64>) -> Result<ProperSvd, FilterError> {
+    fn parameter(self, mean: &PolarMean, near: &Concentrations) -> Result<ProperSvd, FilterError> {
         if self == Self::SevenPoints {
             return Ok(*matrix_fisher_of_seven(&mean.matrix(), SEVEN_POINT_SPREAD)?.svd());
         }
@@ -104,11 +123,20 @@ impl MomentMap {
             _ => None,
         };
         let s = match s {
-            Some(s) => s,
-            None => s_from_complement_near(&g, near).map_err(MatrixFisherError::from)?,
+            Some(s) => in_order(&s),
+            None => {
+                s_from_complement_near(&g, &near.predicted(&g)).map_err(MatrixFisherError::from)?
+            }
         };
         Ok(ProperSvd { u, s, v })
     }
+}
+
+/// Singular values in order also where the rounding of almost equal moments has exchanged them.
+fn in_order(s: &Vector3<f64>) -> Vector3<f64> {
+    let s1 = s[0].max(0.0);
+    let s2 = s[1].clamp(0.0, s1);
+    Vector3::new(s1, s2, s[2].clamp(-s2, s2))
 }
 
 impl BayesFilter for BayesFisher {
@@ -134,8 +162,8 @@ impl BayesFilter for BayesFisher {
             Frame::World => mean.turned_in_world(&turn),
         };
         if self.map == MomentMap::Approximate {
-            let svd = self.map.parameter(&mean, &self.s)?;
-            (self.mean, self.s) = (self.map.mean(&svd)?, svd.s);
+            let svd = self.map.parameter(&mean, &self.last)?;
+            (self.mean, self.last) = self.map.mean(&svd)?;
         } else {
             self.mean = mean;
         }

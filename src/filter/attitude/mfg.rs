@@ -12,20 +12,22 @@ use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::distribution::matrix_fisher_gaussian::{
     ConditionalMoments, Correlation, WeightedSample,
 };
+use crate::distribution::unscented::UnscentedError;
 use crate::so3::{ProperSvd, exp};
 
-/// Weight of the sigma points that turn the attitude, `w_M`; 3/4 is the least that can represent
-/// the uniform distribution.
-const ATTITUDE_WEIGHT: f64 = 0.8;
+/// Weight of the sigma points that turn the attitude, `w_M`: the broader the belief, the more they
+/// need, up to one for the uniform distribution.
+const ATTITUDE_WEIGHT: f64 = 0.9;
 /// Weight of the sigma points that move the bias, `w_G`.
-const BIAS_WEIGHT: f64 = 0.15;
+const BIAS_WEIGHT: f64 = 0.08;
 
 /// How the belief is carried through the kinematics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MfgPropagation {
     /// By its moments (table 4.3).
     Moments,
-    /// By 13 sigma points, each with six of the noise (table 4.4).
+    /// By 13 sigma points, each with six of the noise (table 4.4); by moments where the belief is
+    /// so close to uniform that it has no such points.
     SigmaPoints,
 }
 
@@ -142,7 +144,12 @@ impl BayesFilter for AttitudeMfg {
         step.check()?;
         self.belief = match self.propagation {
             MfgPropagation::Moments => propagate(&self.belief, &self.gyro, step)?,
-            MfgPropagation::SigmaPoints => self.propagated_points(step)?,
+            MfgPropagation::SigmaPoints => match self.propagated_points(step) {
+                Err(FilterError::SigmaPoints(UnscentedError::TooBroad(_))) => {
+                    propagate(&self.belief, &self.gyro, step)?
+                }
+                propagated => propagated?,
+            },
         };
         Ok(())
     }

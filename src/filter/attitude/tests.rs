@@ -312,6 +312,33 @@ fn the_first_order_filter_may_wait_with_its_parameter() {
     }
 }
 
+/// From no knowledge at all, through one direction to a full attitude; the seven points of `uae`
+/// do not represent the uniform distribution.
+#[test]
+fn an_unknown_attitude_becomes_known() {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let truth = sample_haar(&mut rng);
+    let still = InertialStep::turning(Vector3::zeros(), 0.02);
+    for kind in AttitudeFilterKind::ALL {
+        let unknown = AttitudePrior::matrix_fisher(&Matrix3::zeros()).unwrap();
+        let mut filter = kind.start(&GyroModel::isotropic(0.05, 1e-4), &unknown).unwrap();
+        if filter.is_gaussian() || kind == AttitudeFilterKind::Uae {
+            continue;
+        }
+        for axis in [Vector3::x(), Vector3::y()] {
+            for _ in 0..20 {
+                filter.propagate(&still).unwrap();
+                let seen = truth.inverse() * axis;
+                let measured = VectorMeasurement::of_world_direction(axis, seen, 100.0);
+                filter.update_directions(&[measured]).unwrap();
+            }
+            let seen = filter.attitude() * (truth.inverse() * axis);
+            assert!(seen.dot(&axis) > 0.999, "{kind} {seen}");
+        }
+        assert!(angle(&filter.attitude(), &truth) < 0.1, "{kind}");
+    }
+}
+
 fn correlated_belief(correlation: Correlation, s: [f64; 3], scale: f64) -> Belief {
     let v = exp(&Vector3::new(-2.0, 0.3, 0.1));
     let u = exp(&Vector3::new(0.4, -1.0, 0.7));
