@@ -84,7 +84,7 @@ pub fn belief_figure(result: &NeesResult) -> Figure {
                 name: "error".to_owned(),
                 points: series(&result.stamps, &errors),
             }],
-            y_max: None,
+            ..Default::default()
         })
     };
     let degrees = 1.0_f64.to_degrees();
@@ -117,6 +117,7 @@ pub fn nees_figure(result: &NeesResult) -> Figure {
             }],
             curves: vec![Curve { name: "NEES".to_owned(), points: series(&result.stamps, values) }],
             y_max: Some(20.0 * high),
+            ..Default::default()
         })
     };
     Figure {

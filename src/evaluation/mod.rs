@@ -40,7 +40,7 @@ pub use nees::{
     BelievedTrajectory, NeesOptions, NeesResult, NeesSummary, nees, normalised_square,
     read_believed_trajectory,
 };
-pub use plot::{Band, BoxPanel, Curve, CurvePanel, Figure, Panel, PathPanel, PlotError};
+pub use plot::{Band, BoxPanel, Curve, CurvePanel, Figure, Panel, PathPanel, PlotError, Scale};
 pub use relative::{Delta, RpeOptions, RpeResult, rpe};
 pub use report::{Report, write_html};
 pub use statistics::{Statistics, paired_t_test};

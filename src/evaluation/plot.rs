@@ -6,14 +6,16 @@ use std::path::{Path, PathBuf};
 use std::sync::Once;
 
 use plotters::coord::Shift;
+use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
+use serde::Serialize;
 
 use super::statistics::quantile;
 
 /// A picture of several panels.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Figure {
     pub title: String,
     pub panels: Vec<Panel>,
@@ -21,7 +23,7 @@ pub struct Figure {
     pub columns: usize,
 }
 
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub enum Panel {
     Path(PathPanel),
     Curves(CurvePanel),
@@ -29,7 +31,7 @@ pub enum Panel {
 }
 
 /// Two paths in a plane, in equal scales; the second one coloured by a value.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct PathPanel {
     pub title: String,
     pub x_label: String,
@@ -42,8 +44,17 @@ pub struct PathPanel {
     pub value_label: String,
 }
 
+/// How values are laid out along an axis.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub enum Scale {
+    #[default]
+    Linear,
+    /// Decades of equal length; values that are not positive interrupt a line.
+    Logarithmic,
+}
+
 /// Curves over a common axis.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct CurvePanel {
     pub title: String,
     pub x_label: String,
@@ -53,16 +64,18 @@ pub struct CurvePanel {
     pub curves: Vec<Curve>,
     /// Largest value shown, where the curves go far beyond what is of interest.
     pub y_max: Option<f64>,
+    pub x_scale: Scale,
+    pub y_scale: Scale,
 }
 
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Curve {
     pub name: String,
     /// NaN interrupts the line.
     pub points: Vec<[f64; 2]>,
 }
 
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Band {
     pub name: String,
     /// `[x, low, high]`; NaN interrupts the band.
@@ -70,7 +83,7 @@ pub struct Band {
 }
 
 /// Distributions side by side: median, quartiles, 5 % and 95 % quantiles.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct BoxPanel {
     pub title: String,
     pub x_label: String,
@@ -218,7 +231,66 @@ struct Canvas {
     scale: u32,
 }
 
-type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<Axis, Axis>>;
+
+/// One coordinate of a chart.
+#[derive(Clone, Copy)]
+struct Axis {
+    range: [f64; 2],
+    scale: Scale,
+}
+
+impl Axis {
+    fn linear(range: [f64; 2]) -> Self {
+        Self { range, scale: Scale::Linear }
+    }
+
+    /// The axis that holds `values`, its range extended by `pad` (of logarithms where they are
+    /// laid out).
+    fn of(values: impl Iterator<Item = f64>, scale: Scale, pad: fn([f64; 2]) -> [f64; 2]) -> Self {
+        let range = match scale {
+            Scale::Linear => pad(extent(values)),
+            Scale::Logarithmic => pad(extent(values.map(f64::log10))).map(|x| 10f64.powf(x)),
+        };
+        Self { range, scale }
+    }
+
+    /// The value, or NaN where the axis cannot show it.
+    fn shown(&self, value: f64) -> f64 {
+        if self.scale == Scale::Logarithmic && value <= 0.0 { f64::NAN } else { value }
+    }
+}
+
+impl Ranged for Axis {
+    type FormatOption = DefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
+        let [low, high] = self.range;
+        match self.scale {
+            Scale::Linear => RangedCoordf64::from(low..high).map(value, limit),
+            Scale::Logarithmic => {
+                RangedCoordf64::from(low.log10()..high.log10()).map(&value.log10(), limit)
+            }
+        }
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
+        let [low, high] = self.range;
+        let decades = low.log10().ceil() as i32..=high.log10().floor() as i32;
+        match self.scale {
+            Scale::Logarithmic if decades.clone().count() > 1 => {
+                let stride = decades.clone().count().div_ceil(hint.max_num_points().max(1));
+                decades.step_by(stride).map(|decade| 10f64.powi(decade)).collect()
+            }
+            _ => RangedCoordf64::from(low..high).key_points(hint),
+        }
+    }
+
+    fn range(&self) -> std::ops::Range<f64> {
+        self.range[0]..self.range[1]
+    }
+}
 
 /// Room around the axes: top, right, bottom (labels), left (labels).
 const MARGINS: [u32; 4] = [34, 20, 44, 64];
@@ -247,7 +319,7 @@ impl Canvas {
         area: &DrawingArea<DB, Shift>,
         title: &str,
         labels: [&str; 2],
-        ranges: [[f64; 2]; 2],
+        [x, y]: [Axis; 2],
         named: bool,
     ) -> Result<Chart<'a, DB>, PlotError> {
         let [top, right, bottom, left] = MARGINS.map(|margin| self.px(margin));
@@ -257,14 +329,13 @@ impl Canvas {
         let centre = (self.px(SPACE) + left + width.saturating_sub(right)) / 2;
         let position = (centre as i32, self.px(18) as i32);
         area.draw(&Text::new(title.to_owned(), position, style)).map_err(drawing)?;
-        let [x, y] = ranges;
         let mut chart = ChartBuilder::on(area)
             .margin_top(top)
             .margin_right(right)
             .margin_left(self.px(SPACE))
             .x_label_area_size(bottom)
             .y_label_area_size(left)
-            .build_cartesian_2d(x[0]..x[1], y[0]..y[1])
+            .build_cartesian_2d(x, y)
             .map_err(drawing)?;
         let mut mesh = chart.configure_mesh();
         if named {
@@ -318,7 +389,7 @@ impl Canvas {
         let points = || panel.reference.iter().chain(&panel.estimate);
         let ranges = equal_scales([0, 1].map(|k| extent(points().map(|p| p[k]))), inner);
         let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
-        let mut chart = self.chart(&left, &panel.title, labels, ranges, false)?;
+        let mut chart = self.chart(&left, &panel.title, labels, ranges.map(Axis::linear), false)?;
         for run in runs(&panel.reference) {
             let points = thinned(run).map(|p| (p[0], p[1]));
             chart.draw_series(LineSeries::new(points, self.line(REFERENCE, 1))).map_err(drawing)?;
@@ -354,7 +425,7 @@ impl Canvas {
             let corners = [(left, at(step + 1)), (right, at(step))];
             area.draw(&Rectangle::new(corners, color.filled())).map_err(drawing)?;
         }
-        let format = ticks([low, high]);
+        let format = ticks(Axis::linear([low, high]));
         let style = self.text(12).pos(Pos::new(HPos::Left, VPos::Center));
         for quarter in 0..=4 {
             let value = low + (high - low) * f64::from(quarter) / 4.0;
@@ -375,13 +446,16 @@ impl Canvas {
         let x = band_points().map(|p| p[0]).chain(curve_points().map(|p| p[0]));
         let y = band_points().flat_map(|p| [p[1], p[2]]).chain(curve_points().map(|p| p[1]));
         let y_max = panel.y_max.unwrap_or(f64::INFINITY);
-        let ranges = [extent(x), padded(extent(y.map(|value| value.min(y_max))))];
+        let x = Axis::of(x, panel.x_scale, |range| range);
+        let y = Axis::of(y.map(|value| value.min(y_max)), panel.y_scale, padded);
         let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
-        let mut chart = self.chart(area, &panel.title, labels, ranges, false)?;
+        let mut chart = self.chart(area, &panel.title, labels, [x, y], false)?;
         let mut names = 0;
         for (band, color) in panel.bands.iter().zip(COLORS.iter().cycle()) {
             let color = color.mix(0.18);
-            for (k, run) in runs(&band.points).enumerate() {
+            let points: Vec<_> =
+                band.points.iter().map(|p| [x.shown(p[0]), y.shown(p[1]), y.shown(p[2])]).collect();
+            for (k, run) in runs(&points).enumerate() {
                 let upper = thinned(run).map(|p| (p[0], p[2].min(y_max)));
                 let lower: Vec<_> = thinned(run).map(|p| (p[0], p[1].min(y_max))).collect();
                 let outline: Vec<_> = upper.chain(lower.into_iter().rev()).collect();
@@ -399,7 +473,9 @@ impl Canvas {
         }
         for (curve, color) in panel.curves.iter().zip(COLORS.iter().cycle()) {
             let style = self.line(*color, 1);
-            for (k, run) in runs(&curve.points).enumerate() {
+            let points: Vec<_> =
+                curve.points.iter().map(|p| [x.shown(p[0]), y.shown(p[1])]).collect();
+            for (k, run) in runs(&points).enumerate() {
                 let points = thinned(run).map(|p| (p[0], p[1].min(y_max)));
                 let series = chart.draw_series(LineSeries::new(points, style)).map_err(drawing)?;
                 if k == 0 && !curve.name.is_empty() {
@@ -430,13 +506,13 @@ impl Canvas {
             .collect();
         let highest = extent(quantiles.iter().flatten().copied().chain([0.0]));
         let count = panel.groups.len().max(1) as f64;
-        let ranges = [[0.0, count], padded(highest)];
+        let [x, y] = [[0.0, count], padded(highest)].map(Axis::linear);
         let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
-        let mut chart = self.chart(area, &panel.title, labels, ranges, true)?;
+        let mut chart = self.chart(area, &panel.title, labels, [x, y], true)?;
         let style = self.text(12).pos(Pos::new(HPos::Center, VPos::Top));
         let names = panel.groups.iter().enumerate().map(|(index, (name, _))| {
             let below = (0, self.px(8) as i32);
-            EmptyElement::at((index as f64 + 0.5, ranges[1][0]))
+            EmptyElement::at((index as f64 + 0.5, y.range[0]))
                 + Text::new(name.clone(), below, style.clone())
         });
         chart.draw_series(names).map_err(drawing)?;
@@ -516,14 +592,25 @@ fn equal_scales(ranges: [[f64; 2]; 2], pixels: [u32; 2]) -> [[f64; 2]; 2] {
     })
 }
 
-/// Writes numbers with as many decimals as ticks on `range` need.
-fn ticks(range: [f64; 2]) -> impl Fn(&f64) -> String {
-    let spread = (range[1] - range[0]).abs().max(f64::MIN_POSITIVE);
+/// Writes numbers with as many decimals as ticks on the axis need; decades as powers of ten.
+fn ticks(axis: Axis) -> impl Fn(&f64) -> String {
+    let [low, high] = axis.range;
+    let spread = (high - low).abs().max(f64::MIN_POSITIVE);
     // A step is at least a seventh of the range.
     let decimals = (0.8 - spread.log10()).ceil().clamp(0.0, 9.0) as usize;
     let tiny = 1e-9 * spread;
     move |value| {
+        let exponent = value.log10();
+        if axis.scale == Scale::Logarithmic && (exponent - exponent.round()).abs() < 1e-9 {
+            return format!("10{}", superscript(exponent.round() as i32));
+        }
         let value = if value.abs() < tiny { 0.0 } else { *value };
         format!("{value:.decimals$}")
     }
+}
+
+fn superscript(number: i32) -> String {
+    const DIGITS: [char; 10] = ['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'];
+    let raised = |c: char| c.to_digit(10).map_or('⁻', |digit| DIGITS[digit as usize]);
+    number.to_string().chars().map(raised).collect()
 }
