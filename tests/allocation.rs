@@ -5,9 +5,17 @@ use std::cell::Cell;
 use std::hint::black_box;
 
 use mfg_vio::alignment::PointPair;
+use mfg_vio::distribution::matrix_fisher::{
+    MatrixFisher, Moments, s_from_complement, s_from_complement_near,
+};
+use mfg_vio::distribution::matrix_fisher_gaussian::{Correlation, MatrixFisherGaussian};
 use mfg_vio::filter::{FilterConfig, FilterKind};
 use mfg_vio::inertial::{Belief, ImuConfig, ImuSample, NavCovariance, NavState, Propagator, Stamp};
-use nalgebra::{Isometry3, Matrix3, Vector3};
+use mfg_vio::so3::{exp, log, proper_svd};
+use nalgebra::{Const, Isometry3, Matrix3, OMatrix, OVector, Rotation3, U3, Vector3};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::Distribution;
 
 struct Counting;
 
@@ -30,9 +38,9 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-fn allocations(work: impl FnOnce()) -> usize {
+fn allocations<T>(work: impl FnOnce() -> T) -> usize {
     let before = ALLOCATIONS.with(Cell::get);
-    work();
+    black_box(work());
     ALLOCATIONS.with(Cell::get) - before
 }
 
@@ -76,5 +84,55 @@ fn updates_and_imu_steps_of_every_filter_do_not_allocate() {
         let step = allocations(|| assert!(filter.propagate(&sample(0), &sample(1))));
         let update = allocations(|| assert!(filter.update(&pairs).is_some()));
         assert_eq!((step, update), (0, 0), "{kind}");
+    }
+}
+
+/// One triple for each routine of the pass.
+const REGIMES: [[f64; 3]; 4] =
+    [[1e-3, 1e-4, -1e-5], [14.0, 10.0, -3.0], [1e6, 1e6, -1e6], [3e5, 2e5, 1e5]];
+
+#[test]
+fn moments_inversion_and_sampling_allocate_nothing() {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    let r = exp(&Vector3::new(0.1, 0.2, 0.3));
+    for s in REGIMES.map(Vector3::from) {
+        // The first call fills tables that all later ones share.
+        let g = Moments::new(&s).unwrap().complement();
+        assert_eq!(allocations(|| Moments::new(&s)), 0, "{s}");
+        assert_eq!(allocations(|| s_from_complement(&g)), 0, "{s}");
+        assert_eq!(allocations(|| s_from_complement_near(&g, &(s * 1.001))), 0, "{s}");
+        let fisher = MatrixFisher::new(&(r.matrix() * Matrix3::from_diagonal(&s))).unwrap();
+        let mean = fisher.mean();
+        assert_eq!(allocations(|| MatrixFisher::from_mean(&mean)), 0, "{s}");
+        assert_eq!(allocations(|| fisher.fuse(&fisher)), 0, "{s}");
+        assert_eq!(allocations(|| fisher.log_density(&r)), 0, "{s}");
+        assert_eq!(allocations(|| fisher.rotation_covariance()), 0, "{s}");
+        assert_eq!(allocations(|| fisher.sampler().sample(&mut rng)), 0, "{s}");
+    }
+    assert_eq!(allocations(|| log(&exp(&Vector3::x()))), 0);
+    assert_eq!(allocations(|| proper_svd(r.matrix())), 0);
+}
+
+#[test]
+fn a_matrix_fisher_gaussian_of_fixed_size_allocates_nothing() {
+    type Fifteen = Const<15>;
+    for s in REGIMES.map(Vector3::from) {
+        let attitude = MatrixFisher::new(&Matrix3::from_diagonal(&s)).unwrap();
+        let belief = MatrixFisherGaussian::new(
+            attitude,
+            OVector::<f64, Fifteen>::zeros(),
+            OMatrix::<f64, Fifteen, Fifteen>::identity(),
+            OMatrix::<f64, Fifteen, U3>::repeat(1e-5),
+            Correlation::World,
+        )
+        .unwrap();
+        let moments = belief.conditional_moments();
+        let estimate =
+            || MatrixFisherGaussian::from_moments(attitude, Correlation::World, &moments);
+        assert_eq!(allocations(estimate), 0, "{s}");
+        let r = Rotation3::identity();
+        assert_eq!(allocations(|| belief.log_density(&r, belief.mu())), 0, "{s}");
+        assert_eq!(allocations(|| belief.moments()), 0, "{s}");
+        assert_eq!(allocations(|| belief.attitude_given(belief.mu())), 0, "{s}");
     }
 }

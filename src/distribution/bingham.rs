@@ -145,6 +145,18 @@ impl Bingham {
 }
 
 /// Exact sampler of a Bingham distribution.
+///
+/// ```
+/// # use mfg_vio::distribution::Bingham;
+/// # use nalgebra::{Matrix4, Vector3};
+/// # use rand::{SeedableRng, distr::Distribution};
+/// let bingham = Bingham::from_axes(Matrix4::identity(), Vector3::new(-20.0, -50.0, -90.0))?;
+/// let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+/// let samples = bingham.sampler().sample_iter(&mut rng).take(1000);
+/// let moment = samples.map(|q| q * q.transpose()).sum::<Matrix4<f64>>() / 1000.0;
+/// assert!((moment - bingham.second_moment()).amax() < 0.01);
+/// # Ok::<(), mfg_vio::distribution::BinghamError>(())
+/// ```
 #[derive(Debug, Clone, Copy)]
 pub struct BinghamSampler {
     axes: Matrix4<f64>,

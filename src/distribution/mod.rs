@@ -13,12 +13,24 @@
 //! 6. [`unscented`]: a handful of weighted points that stand for any of these; [`progressive`]
 //!    updates with them.
 //!
+//! What they look like, up to constants, for a rotation `R`, a unit quaternion `q`, a direction `y`
+//! and a vector `x`:
+//!
+//! ```math
+//! \text{matrix Fisher} \quad & \exp(\tr(F^\top R)) & (2.16) \\
+//! \text{Bingham} \quad & \exp(q^\top A q) & (2.24) \\
+//! \text{von Mises-Fisher} \quad & \exp(\kappa m^\top y) & (4.3) \\
+//! \text{matrix Fisher-Gaussian} \quad & \exp(\tr(F^\top R) -
+//!   \frac{1}{2} (x - \mu - P v_R)^\top \Sigma_c^{-1} (x - \mu - P v_R)) & (3.1)
+//! ```
+//!
 //! Densities are with respect to the uniform distribution on the rotations (spheres) and to
 //! Lebesgue measure on vectors. Short names of sources: **W22**, W. Wang, *Matrix Fisher-Gaussian
 //! distribution* (dissertation, 2022); **L-UAE**, T. Lee, *Global unscented attitude estimation
 //! via the matrix Fisher distributions on SO(3)*; **L-AMF**, T. Lee, *Bayesian attitude estimation
 //! with approximate matrix Fisher distributions on SO(3)*; **FNF**, Wang, Gui, Zhong on fast
 //! nonlinear filtering. Bare numbers in parentheses are equations of W22.
+#![doc = include_str!("../../docs/math.html")]
 
 mod bingham;
 mod bingham_gaussian;

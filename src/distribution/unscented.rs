@@ -1,4 +1,28 @@
 //! Unscented transforms: weighted points that carry a distribution through a nonlinear map.
+//!
+//! All of them are the mode and six turns, by plus and minus an angle about each principal axis:
+//!
+//! ```math
+//! R_0 = U V^\top , \qquad R_{i\pm} = U \exp(\pm \theta_i \hat e_i) V^\top .
+//! ```
+//!
+//! | points | angles | weights | determined by |
+//! | --- | --- | --- | --- |
+//! | [`seven_points`] (L-UAE 11, 12) | the log-density falls by `1 - sigma` of its way to zero | equal | `F` |
+//! | [`weighted_points`] (4.45-4.47) | of one density | such that `E[R]` is exact | `F` |
+//! | [`bingham_points`] (after theorem 4.7) | such that `E[R]` is exact | by axis | `E[R]` alone |
+//!
+//! The angles and weights of the second kind satisfy, with the spread fixed by the total weight,
+//!
+//! ```math
+//! 1 - \cos \theta_i = \frac{\sigma}{s_j + s_k} , \qquad
+//! w_i = \frac{E[x_i^2]}{1 - \cos \theta_i} .
+//! ```
+//!
+//! A matrix Fisher-Gaussian distribution adds `2n` points along the columns of the root of the
+//! covariance of `x` given `R`, at the mode
+//! ([`sigma_points`](MatrixFisherGaussian::sigma_points)).
+#![doc = include_str!("../../docs/math.html")]
 
 use nalgebra::allocator::Allocator;
 use nalgebra::{DefaultAllocator, Dim, Matrix3, OVector, Rotation3, U1, U3, Vector3};
@@ -32,6 +56,27 @@ pub enum UnscentedError {
 }
 
 /// An attitude with its weight.
+///
+/// ```
+/// # use mfg_vio::distribution::matrix_fisher::MatrixFisher;
+/// # use mfg_vio::distribution::unscented::{
+/// #     WeightedRotation, bingham_points, matrix_fisher_of_seven, mean_rotation, seven_points,
+/// #     weighted_points,
+/// # };
+/// # use nalgebra::{Matrix3, Rotation3, Vector3};
+/// let fisher = MatrixFisher::new(&Matrix3::from_diagonal(&Vector3::new(30.0, 9.0, 4.0)))?;
+/// // Two ways to carry E[R] in seven points.
+/// for points in [weighted_points(&fisher, 0.7)?, bingham_points(&fisher.mean(), 0.5)?] {
+///     assert!((mean_rotation(&points) - fisher.mean()).norm() < 1e-12);
+/// }
+/// // Those of equal weight are inverted; a turn of all of them is a turn of the distribution.
+/// let turn = Rotation3::from_scaled_axis(Vector3::new(0.1, 0.2, 0.3));
+/// let turned = seven_points(&fisher, 0.9)?
+///     .map(|p| WeightedRotation { attitude: turn * p.attitude, ..p });
+/// let found = matrix_fisher_of_seven(&mean_rotation(&turned), 0.9)?;
+/// assert!((found.parameter() - turn.matrix() * fisher.parameter()).norm() < 1e-8);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, Copy)]
 pub struct WeightedRotation {
     pub weight: f64,

@@ -91,3 +91,49 @@ impl MatrixFisher {
         exponent + scaled_i0.ln() - self.moments().log_c_scaled()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::so3::{HaarQuadrature, exp};
+
+    /// The first column of a uniform rotation is uniform on the sphere: integrals and moments of
+    /// the marginal density against those of the distribution itself.
+    #[test]
+    fn axis_densities_are_the_marginals() {
+        let grid = HaarQuadrature::of_degree(40);
+        let (u, v) = (exp(&Vector3::new(0.4, -1.0, 0.7)), exp(&Vector3::new(-2.0, 0.3, 0.1)));
+        for s in [[3.0, 2.0, -1.0], [4.0, 4.0, -4.0], [5.0, 0.0, 0.0], [6.0, 3.0, 2.0]] {
+            let fisher = MatrixFisher::from_svd(ProperSvd { u, s: Vector3::from(s), v }).unwrap();
+            let second = fisher.second_moment();
+            for axis in 0..3 {
+                let marginal = |f: &dyn Fn(&Vector3<f64>) -> f64| {
+                    grid.integrate(|r| {
+                        let r = r.matrix().column(0).into_owned();
+                        fisher.log_axis_density(axis, &r).exp() * f(&r)
+                    })
+                };
+                assert!((marginal(&|_| 1.0) - 1.0).abs() < 1e-9, "{s:?}");
+                for i in 0..3 {
+                    let mean = marginal(&|r| r[i]);
+                    assert!((mean - fisher.mean()[(i, axis)]).abs() < 1e-9, "{s:?}");
+                    let square = marginal(&|r| r[i] * r[(i + 1) % 3]);
+                    let expected = second[(3 * axis + i, 3 * axis + (i + 1) % 3)];
+                    assert!((square - expected).abs() < 1e-9, "{s:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn canonical_axes_are_a_decomposition_of_the_same_matrix() {
+        let (u, v) = (exp(&Vector3::new(0.4, -1.0, 0.7)), exp(&Vector3::new(-2.0, 0.3, 0.1)));
+        for s in [[3.0, 2.0, -1.0], [4.0, 4.0, -4.0], [5.0, 0.0, 0.0], [2.0, 2.0, 1.0], [0.0; 3]] {
+            let svd = ProperSvd { u, s: Vector3::from(s), v };
+            let canonical = canonical_axes(&svd);
+            assert!((canonical.matrix() - svd.matrix()).norm() < 1e-13, "{s:?}");
+            let again = canonical_axes(&canonical);
+            assert!((again.u.matrix() - canonical.u.matrix()).norm() < 1e-13, "{s:?}");
+        }
+    }
+}

@@ -94,6 +94,12 @@ pub(super) fn complement_row(i: usize) -> usize {
     i
 }
 
+/// `E[(1 - Q_ii)(1 - Q_jj)(1 - Q_kk)]` from the cubic moments of a basis.
+pub(super) fn complement_product(basis: Basis, cubics: &Cubic, [i, j, k]: [usize; 3]) -> f64 {
+    let row = &TABLES.complements[basis as usize][i % 3][j % 3][k % 3];
+    row.iter().zip(cubics).map(|(a, b)| a * b).sum()
+}
+
 /// Row of the product of one to three entries of `Q`, each `(row, column)` from 0 to 2; `None`
 /// where the moment vanishes (corollary 2.1).
 pub(super) fn row(entries: &[(usize, usize)]) -> Option<usize> {
@@ -105,6 +111,8 @@ struct Tables {
     rows: [[Cubic; FORMS]; 3],
     /// Row of each product, by decimal code of its entries (1 to 9 each).
     index: [u8; 1000],
+    /// Products of three complements, by their indices.
+    complements: [[[[Cubic; 3]; 3]; 3]; 3],
 }
 
 static TABLES: LazyLock<Tables> = LazyLock::new(Tables::new);
@@ -113,15 +121,27 @@ impl Tables {
     fn new() -> Self {
         let (forms, index) = distinct_forms();
         let bases = [Basis::Diagonal, Basis::Circles, Basis::Squares];
-        let rows = bases.map(|basis| {
-            let change = cubic_change(&basis.squares_from_basis());
+        let changes = bases.map(|basis| cubic_change(&basis.squares_from_basis()));
+        let changed = |form: &Cubic, change: &[Cubic; CUBICS]| -> Cubic {
+            std::array::from_fn(|m| (0..CUBICS).map(|y| form[y] * change[y][m]).sum())
+        };
+        let rows = changes.map(|change| {
             let mut rows = [[0.0; CUBICS]; FORMS];
             for (row, form) in rows.iter_mut().zip(&forms) {
-                *row = std::array::from_fn(|m| (0..CUBICS).map(|y| form[y] * change[y][m]).sum());
+                *row = changed(form, &change);
             }
             rows
         });
-        Self { rows, index }
+        let triple =
+            |[i, j, k]: [usize; 3]| cubic_of(&multiply(&multiply(&small(i), &small(j)), &small(k)));
+        let complements = changes.map(|change| {
+            std::array::from_fn(|i| {
+                std::array::from_fn(|j| {
+                    std::array::from_fn(|k| changed(&triple([i, j, k]), &change))
+                })
+            })
+        });
+        Self { rows, index, complements }
     }
 }
 
@@ -152,9 +172,12 @@ fn distinct_forms() -> (Vec<Cubic>, [u8; 1000]) {
 type Sextic = Vec<([usize; 4], f64)>;
 
 /// `1 - Q_ii = 2 (sum of x_j^2 over j neither 0 nor i)`.
+fn small(i: usize) -> Sextic {
+    (1..4).filter(|&j| j != i + 1).map(|j| (square(j), 2.0)).collect()
+}
+
 fn complement(i: usize) -> Cubic {
-    let quadratic: Sextic = (1..4).filter(|&j| j != i + 1).map(|j| (square(j), 2.0)).collect();
-    cubic_of(&multiply(&multiply(&quadratic, &norm()), &norm()))
+    cubic_of(&multiply(&multiply(&small(i), &norm()), &norm()))
 }
 
 /// The even part of a product of entries of `Q`, each numbered from 1 to 9 by rows.

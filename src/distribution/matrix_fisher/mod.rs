@@ -2,24 +2,78 @@
 //!
 //! # Definition
 //!
-//! `R ~ M(F)` has the density `exp(tr(F^T R))/c(F)` with respect to the normalized Haar measure
-//! (2.16). With the proper singular value decomposition `F = U S V^T`, `s1 >= s2 >= |s3|`, the
-//! rotation `Q = U^T R V ~ M(S)` is centred at the identity; `U V^T` is the mode and the mean
+//! `R ~ M(F)` has the density, with respect to the normalized Haar measure (2.16),
+//!
+//! ```math
+//! p(R) = \frac{\exp(\tr(F^\top R))}{c(F)}, \qquad
+//! c(F) = \int_{\mathrm{SO}(3)} \exp(\tr(F^\top R)) \, dR .
+//! ```
+//!
+//! With the proper singular value decomposition (2.17)
+//!
+//! ```math
+//! F = U S V^\top, \qquad S = \diag(s_1, s_2, s_3), \qquad s_1 \ge s_2 \ge |s_3|,
+//! ```
+//!
+//! the rotation `Q = U^T R V ~ M(S)` is centred at the identity; `U V^T` is the mode and the mean
 //! attitude, the columns of `U` are the principal axes in the world and those of `V` in the body
 //! frame, and `s_j + s_k` is the concentration about the `i`-th of them (2.21).
+//!
+//! # Moments
+//!
+//! The constant generates them: for any matrix `T` (2.43), (2.19), (2.20), (2.44)
+//!
+//! ```math
+//! E[\exp(\tr(T^\top Q))] &= \frac{c(S + T)}{c(S)} , \\
+//! E[R] &= U D V^\top, \qquad d_i = E[Q_{ii}] = \frac{\partial \log c(S)}{\partial s_i} , \\
+//! E[Q_{i_1 j_1} \cdots Q_{i_n j_n}] &=
+//!   \frac{1}{c(S)} \frac{\partial^n c(S + T)}{\partial T_{i_1 j_1} \cdots \partial T_{i_n j_n}} .
+//! ```
+//!
+//! A moment vanishes unless each of the indices 1, 2, 3 occurs an even number of times among all
+//! rows and columns (corollary 2.1). `E[R]` is a sufficient statistic: the maximum likelihood
+//! estimate solves `d(S) = d` for the singular values `d` of the mean of samples.
+//!
+//! # Information
+//!
+//! Fisher information of the mean attitude (4.22), measure of observability (4.24), entropy, and
+//! divergence between two of them, in the forms that keep their digits at any concentration:
+//!
+//! ```math
+//! I(R^*) &= \frac{1}{2} \diag((d_2 + d_3)(s_2 + s_3), (d_1 + d_3)(s_1 + s_3), (d_1 + d_2)(s_1 + s_2)) , \\
+//! \rho &= (d_1 + d_2)(d_1 + d_3)(d_2 + d_3) , \\
+//! H &= \log(c(S) e^{-\tr S}) + \sum_i s_i (1 - d_i) .
+//! ```
 //!
 //! # How it is computed
 //!
 //! The unit quaternion `x` of `Q` has the density `exp(-2 sum_i (s_j + s_k) x_i^2)`: a Bingham
-//! distribution whose exponents are sums of singular values, never differences. One pass over it
-//! gives the exponentially scaled constant `c(S) exp(-tr S)` (L-AMF 19) and all moments to order
-//! three ([`Moments`], with measured errors). Three routines share the plane of concentrations:
+//! distribution (theorem 2.2) whose exponents are sums of singular values, never differences. One
+//! pass over it gives the exponentially scaled constant `c(S) exp(-tr S)` (L-AMF 19) and all
+//! moments to order three ([`Moments`], with measured errors). Three routines share the plane of
+//! concentrations:
 //!
 //! | where | routine |
 //! | --- | --- |
 //! | `s1 + s2 <= 1/64` | power series of `c` in `S` with exact Haar moments |
 //! | `s2 + s3 >= 25` | asymptotic series in `1/(s_j + s_k)`, all of whose terms are positive |
 //! | elsewhere | Gauss-Legendre panels over both scales of a one-dimensional integral |
+//!
+//! The integral has `u = x_2^2 + x_3^2` for its variable; on the two circles that remain, exponents
+//! are linear in a cosine and integrate to scaled Bessel functions `I_0(t) exp(-t)`:
+//!
+//! ```math
+//! c(S) e^{-\tr S} = \int_0^1 e^{-2 (s_1 + s_3) u} \,
+//!   I_0^e((s_2 + s_3)(1 - u)) \, I_0^e((s_2 - s_3) u) \, du .
+//! ```
+//!
+//! The series of the concentrated regime starts at (2.59) and is, for `r^2 = x_1^2 + x_2^2 +
+//! x_3^2`,
+//!
+//! ```math
+//! c(S) e^{-\tr S} = \frac{E[(1 - r^2)^{-1/2}]}{\sqrt{8 \pi (s_1 + s_2)(s_1 + s_3)(s_2 + s_3)}} ,
+//!   \qquad x_i \sim \mathcal{N}(0, \frac{1}{4 (s_j + s_k)}) .
+//! ```
 //!
 //! The inverse, `S` from `E[R]` ([`s_from_d`], [`MatrixFisher::from_mean`]), is Newton's method on
 //! a form of the likelihood equations that is almost linear where the distribution is
@@ -54,6 +108,8 @@
 //!   orders the exponents `z1 >= z3 >= z2`, theorem 2.2 `z1 >= z2 >= z3`.
 //! - W22 (3.9), (3.10) drop a term that is of the order of the correlation; see
 //!   [`attitude_given`](super::matrix_fisher_gaussian::MatrixFisherGaussian::attitude_given).
+//! - W22 theorem A.1 leaves its integer open; it is `a(n) = (2n)! binomial(1/2, n)`.
+#![doc = include_str!("../../../docs/math.html")]
 
 mod approximation;
 mod axes;

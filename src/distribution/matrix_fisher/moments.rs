@@ -1,7 +1,7 @@
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3, Vector4};
 
 use super::engine::{self, Sums};
-use super::forms::{self, FORMS};
+use super::forms::{self, Basis, CUBICS, FORMS};
 use super::{InvalidSingularValues, check_singular_values};
 
 /// Normalizing constant and all moments up to order three of `Q = U^T R V ~ M(S)`, from one pass.
@@ -19,6 +19,14 @@ use super::{InvalidSingularValues, check_singular_values};
 ///
 /// Relative errors hold for every moment by itself, also for one that is far below its natural
 /// scale because it vanishes with a singular value. Nothing is allocated.
+///
+/// Moments are derivatives of the constant (lemma 2.5): `c` has the first, second and third
+/// derivatives `c E[Q_ii]`, `c E[Q_ii Q_jj]`, `c E[Q_ii Q_jj Q_kk]` with respect to `s`, `log c`
+/// has the gradient [`first`](Self::first) and the Hessian
+/// [`diagonal_covariance`](Self::diagonal_covariance), and the exponentially scaled constant `C`
+/// has `-C E[1 - Q_ii]`, `C E[(1 - Q_ii)(1 - Q_jj)]`, `-C E[(1 - Q_ii)(1 - Q_jj)(1 - Q_kk)]`
+/// ([`complement`](Self::complement), [`complement_second`](Self::complement_second),
+/// [`complement_third`](Self::complement_third)).
 ///
 /// ```
 /// # use mfg_vio::distribution::matrix_fisher::Moments;
@@ -39,6 +47,8 @@ pub struct Moments {
     squares: [f64; 3],
     products: [[f64; 3]; 3],
     forms: [f64; FORMS],
+    cubics: [f64; CUBICS],
+    basis: Basis,
 }
 
 impl Moments {
@@ -59,6 +69,8 @@ impl Moments {
             squares: pass.squares,
             products: pass.products,
             forms,
+            cubics: pass.cubics,
+            basis: pass.basis,
         }
     }
 
@@ -93,6 +105,17 @@ impl Moments {
         Vector3::from_fn(|i, _| self.forms[forms::complement_row(i)])
     }
 
+    /// `E[(1 - Q_ii)(1 - Q_jj)]`, to full relative accuracy; indices from 0 to 2.
+    pub fn complement_second(&self, i: usize, j: usize) -> f64 {
+        let terms = small(i).map(|k| small(j).map(|l| self.products[k][l]));
+        4.0 * terms.iter().flatten().sum::<f64>()
+    }
+
+    /// `E[(1 - Q_ii)(1 - Q_jj)(1 - Q_kk)]`, to full relative accuracy; indices from 0 to 2.
+    pub fn complement_third(&self, i: usize, j: usize, k: usize) -> f64 {
+        forms::complement_product(self.basis, &self.cubics, [i, j, k])
+    }
+
     /// `E[Q_ij Q_kl]` for the entries `(i, j)` and `(k, l)`, indices from 0 to 2.
     pub fn second(&self, a: (usize, usize), b: (usize, usize)) -> f64 {
         self.form(&[a, b])
@@ -113,7 +136,6 @@ impl Moments {
     /// Computed from the small quantities `1 - Q_ii = 2 (x_j^2 + x_k^2)`.
     pub fn diagonal_covariance(&self) -> Matrix3<f64> {
         let covariance = self.square_covariance();
-        let small = |i: usize| [(i + 1) % 3, (i + 2) % 3];
         Matrix3::from_fn(|i, j| {
             let terms = small(i).map(|k| small(j).map(|l| covariance[(k, l)]));
             4.0 * terms.iter().flatten().sum::<f64>()
@@ -150,6 +172,11 @@ impl Moments {
     fn form(&self, entries: &[(usize, usize)]) -> f64 {
         forms::row(entries).map_or(0.0, |row| self.forms[row])
     }
+}
+
+/// Indices of the components in `1 - Q_ii = 2 (x_j^2 + x_k^2)`.
+fn small(i: usize) -> [usize; 2] {
+    [(i + 1) % 3, (i + 2) % 3]
 }
 
 /// Third moments that vanish with a single singular value.

@@ -371,6 +371,28 @@ mod tests {
         }
     }
 
+    /// Theorem A.1. Its integer is `a(n) = (2n)! binomial(1/2, n)`: for an entry `t` at `(i, j)`
+    /// alone `s_i + s_j` becomes the square root of `(s_i + s_j)^2 + t^2`, and so the difference.
+    #[test]
+    fn repeated_entries_move_singular_values_as_in_the_closed_form() {
+        let s = Vector3::new(5.0, 3.0, -1.0);
+        for (i, j) in [(0, 1), (1, 0), (0, 2), (2, 1)] {
+            let mut integer = 1.0;
+            for n in 1..=4 {
+                let k = f64::from(n);
+                integer *= 2.0 * k * (2.0 * k - 1.0) * (1.5 - k) / k;
+                let entries = vec![(i, j); 2 * n as usize];
+                let jets = singular_value_jets(&s, &entries);
+                let derivative = |axis: usize| jets[axis][(1 << (2 * n)) - 1];
+                for sign in [1.0, -1.0] {
+                    let found = derivative(i) + sign * derivative(j);
+                    let expected = integer / (s[i] + sign * s[j]).powi(2 * n - 1);
+                    assert!((found / expected - 1.0).abs() < 1e-10, "{i} {j} {n} {found}");
+                }
+            }
+        }
+    }
+
     #[test]
     fn what_the_recursion_cannot_do_is_refused() {
         let repeated = HigherMoments::new(&Vector3::new(2.0, 1.0, -1.0));

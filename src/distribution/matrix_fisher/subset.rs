@@ -71,3 +71,63 @@ impl MatrixFisher {
         SubsetConcentration { mean_angle: y.atan2(x), concentration: x.hypot(y) }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Matrix3;
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::so3::exp;
+
+    fn fisher() -> impl Strategy<Value = MatrixFisher> {
+        prop::array::uniform9(-20.0..20.0f64)
+            .prop_map(|f| MatrixFisher::new(&Matrix3::from_iterator(f)).unwrap())
+    }
+
+    fn vector() -> impl Strategy<Value = Vector3<f64>> {
+        prop::array::uniform3(-3.0..3.0f64)
+            .prop_map(Vector3::from)
+            .prop_filter("not zero", |v| v.norm() > 0.1)
+    }
+
+    proptest! {
+        /// FNF theorem III.1.
+        #[test]
+        fn density_along_a_subset_is_von_mises(
+            fisher in fisher(), origin in vector(), axis in vector(), angle in -3.0..3.0f64,
+        ) {
+            let (origin, axis) = (exp(&origin), axis.normalize());
+            let subset = fisher.on_subset(&origin, &axis);
+            let at = |theta: f64| fisher.log_density(&(origin * exp(&(axis * theta))));
+            let expected = subset.concentration * ((angle - subset.mean_angle).cos() - 1.0);
+            prop_assert!((at(angle) - at(subset.mean_angle) - expected).abs() < 1e-11);
+        }
+
+        /// FNF theorem III.3.
+        #[test]
+        fn fusion_on_a_subset_is_that_of_the_distributions(
+            first in fisher(), second in fisher(), origin in vector(), axis in vector(),
+        ) {
+            let (origin, axis) = (exp(&origin), axis.normalize());
+            let [a, b] = [&first, &second].map(|f| f.on_subset(&origin, &axis));
+            let fused = first.fuse(&second).unwrap().on_subset(&origin, &axis);
+            let found = a.fuse_fisher(&b);
+            prop_assert!((found.concentration - fused.concentration).abs() < 1e-11);
+            let angle = (found.mean_angle - fused.mean_angle).sin() * fused.concentration;
+            prop_assert!(angle.abs() < 1e-11);
+        }
+    }
+
+    /// FNF theorem III.4: products of Gaussians on a line, the shorter way around.
+    #[test]
+    fn gaussians_fuse_by_precision_across_the_cut() {
+        let at = |mean_angle, concentration| SubsetConcentration { mean_angle, concentration };
+        let fused = at(3.0, 1.0).fuse_gaussian(&at(-3.0, 3.0));
+        assert_eq!(fused.concentration, 4.0);
+        let offset = 2.0 * PI - 6.0;
+        assert!((fused.mean_angle - (3.0 + 0.75 * offset - 2.0 * PI)).abs() < 1e-14);
+        let none = at(1.0, 0.0).fuse_gaussian(&at(2.0, 0.0));
+        assert_eq!(none, at(1.0, 0.0));
+    }
+}

@@ -103,8 +103,111 @@ fn moments_agree_with_quadrature_on_the_group() {
     }
 }
 
+/// Composite Gauss-Legendre nodes on `[0, end]` whose panels halve down to `finest`.
+fn graded_nodes(end: f64, finest: f64) -> Vec<(f64, f64)> {
+    let rule = gauss_quad::legendre::GaussLegendre::new(std::num::NonZeroUsize::new(12).unwrap());
+    let mut nodes = Vec::new();
+    let mut panel_end = end;
+    while panel_end > 0.0 {
+        let start = if panel_end > finest { 0.5 * panel_end } else { 0.0 };
+        let half = 0.5 * (panel_end - start);
+        nodes.extend(rule.iter().map(|(x, w)| (start + half * (1.0 + x), half * w)));
+        panel_end = start;
+    }
+    nodes
+}
+
+/// `E[w^n exp(-2 t w)]` for `n = 0..3` and `w = sin^2(phi/2)`, `phi` uniform on the circle.
+fn circle_integrals(t: f64) -> [f64; 4] {
+    let mut sums = [0.0; 4];
+    for (phi, weight) in graded_nodes(std::f64::consts::PI, 0.5 / (1.0 + t).sqrt()) {
+        let w = (0.5 * phi).sin().powi(2);
+        let density = weight * (-2.0 * t * w).exp() / std::f64::consts::PI;
+        for (n, sum) in sums.iter_mut().enumerate() {
+            *sum += density * w.powi(n as i32);
+        }
+    }
+    sums
+}
+
+/// The constant and the moments `E[y1^p y2^q y3^r]` of the squared quaternion components by
+/// brute force: plain quadrature over all three coordinates of the sphere.
+fn brute_force(s: &Vector3<f64>) -> (f64, [f64; 20]) {
+    let Sums { a, difference } = Sums::of_singular_values(s);
+    let mut constant = 0.0;
+    let mut cubics = [0.0; 20];
+    for (v, weight) in graded_nodes(1.0, 0.1 / (1.0 + a[2]).sqrt()) {
+        let u = v * v;
+        let (first, second) =
+            (circle_integrals(a[0] * (1.0 - u)), circle_integrals(difference * u));
+        let density = 2.0 * v * weight * (-2.0 * a[1] * u).exp();
+        constant += density * first[0] * second[0];
+        for (cubic, [_, p, q, r]) in cubics.iter_mut().zip(forms::MONOMIALS) {
+            // y1 = (1 - u) w, y2 = u (1 - z), y3 = u z; (1 - z)^q z^r by the binomial theorem.
+            let beta = match q {
+                0 => second[r],
+                1 => second[r] - second[r + 1],
+                2 => second[r] - 2.0 * second[r + 1] + second[r + 2],
+                _ => second[0] - 3.0 * second[1] + 3.0 * second[2] - second[3],
+            };
+            *cubic += density * (1.0 - u).powi(p as i32) * first[p] * u.powi((q + r) as i32) * beta;
+        }
+    }
+    (constant, cubics.map(|c| c / constant))
+}
+
+/// The whole plane of concentrations, with repetitions, opposites and zeros.
+fn grid() -> Vec<Vector3<f64>> {
+    const LEVELS: [f64; 10] = [0.0, 1e-6, 1e-4, 1e-2, 0.5, 3.0, 20.0, 500.0, 1e5, 1e8];
+    let mut grid = Vec::new();
+    for (i, &s1) in LEVELS.iter().enumerate() {
+        for (j, &s2) in LEVELS.iter().enumerate().take(i + 1) {
+            for &s3 in &LEVELS[..=j] {
+                grid.extend([s3, -s3].map(|s3| Vector3::new(s1, s2, s3)));
+            }
+        }
+    }
+    grid
+}
+
+/// Moments of `Q` against the scale of their factors, so that one that vanishes by symmetry is
+/// not asked for more than double precision holds.
+#[test]
+fn moments_agree_with_brute_force_over_the_plane_of_concentrations() {
+    let (mut worst_first, mut worst_third) = (0.0_f64, 0.0_f64);
+    for s in grid() {
+        let found = Moments::new(&s).unwrap();
+        let (c_scaled, cubics) = brute_force(&s);
+        let values = forms::evaluate(forms::Basis::Squares, &cubics);
+        let value = |entries: &[(usize, usize)]| forms::row(entries).map_or(0.0, |n| values[n]);
+        worst_first = worst_first.max((found.c_scaled() / c_scaled - 1.0).abs());
+        for i in 0..3 {
+            let complement = values[forms::complement_row(i)];
+            worst_first = worst_first.max((found.complement()[i] / complement - 1.0).abs());
+            for (j, k) in [(0, 0), (0, 1), (1, 2), (2, 2)] {
+                let product = forms::complement_product(forms::Basis::Squares, &cubics, [i, j, k]);
+                let ratio = found.complement_third(i, j, k) / product;
+                worst_first = worst_first.max((ratio - 1.0).abs());
+            }
+        }
+        let entries: Vec<_> = (0..9).map(|n| (n / 3, n % 3)).collect();
+        let size = |a: (usize, usize)| value(&[a, a]).sqrt();
+        for &a in &entries {
+            for &b in &entries {
+                let error = (found.second(a, b) - value(&[a, b])).abs() / (size(a) * size(b));
+                worst_third = worst_third.max(error);
+                for &c in &entries {
+                    let error = (found.third(a, b, c) - value(&[a, b, c])).abs();
+                    worst_third = worst_third.max(error / (size(a) * size(b) * size(c)));
+                }
+            }
+        }
+    }
+    assert!(worst_first < 1e-12 && worst_third < 1e-12, "{worst_first:e} {worst_third:e}");
+}
+
 fn singular_values() -> impl Strategy<Value = Vector3<f64>> {
-    let exponent = -4.0..6.0f64;
+    let exponent = -6.0..10.0f64;
     (prop::array::uniform3(exponent), any::<bool>(), 0..4u8).prop_map(|(e, negative, ties)| {
         let mut s = e.map(|e| 10f64.powf(e));
         s.sort_by(|a, b| b.total_cmp(a));
@@ -216,6 +319,83 @@ fn derivatives_of_the_log_constant_are_the_moments() {
         assert!((slope - moments(s.into()).first()[i]).abs() < 1e-8);
         let curvature = (plus.first() - minus.first()) / (2.0 * h);
         assert!((curvature - covariance.column(i)).norm() < 1e-8);
+    }
+}
+
+#[test]
+fn derivatives_of_the_scaled_constant_are_moments_of_the_complement() {
+    let s = Vector3::new(7.0, 3.0, -1.0);
+    let h = 1e-4;
+    for i in 0..3 {
+        let mut step = Vector3::zeros();
+        step[i] = h;
+        let (plus, minus) = (moments((s + step).into()), moments((s - step).into()));
+        let middle = moments(s.into());
+        let slope = |f: &dyn Fn(&Moments) -> f64| {
+            let scaled = |m: &Moments| m.c_scaled() * f(m);
+            (scaled(&plus) - scaled(&minus)) / (2.0 * h * middle.c_scaled())
+        };
+        assert!((slope(&|_| 1.0) + middle.complement()[i]).abs() < 1e-7);
+        for j in 0..3 {
+            let second = slope(&|m| m.complement()[j]);
+            assert!((second + middle.complement_second(i, j)).abs() < 1e-7);
+            for k in 0..3 {
+                let third = slope(&|m| m.complement_second(j, k));
+                assert!((third + middle.complement_third(i, j, k)).abs() < 1e-7);
+            }
+        }
+    }
+}
+
+/// (2.43): the moment generating function `E[exp(tr(T^T Q))] = c(S + T)/c(S)`.
+#[test]
+fn generating_function_is_the_ratio_of_constants() {
+    let grid = HaarQuadrature::of_degree(40);
+    let t = Matrix3::new(0.5, -1.0, 0.3, 0.2, 0.4, -0.6, -0.9, 0.1, 0.7);
+    for s in [[0.0; 3], [2.0, 1.0, -1.0], [5.0, 3.0, 2.0]] {
+        let fisher = MatrixFisher::new(&Matrix3::from_diagonal(&Vector3::from(s))).unwrap();
+        let shifted = MatrixFisher::new(&(fisher.parameter() + t)).unwrap();
+        let ratio = (shifted.moments().log_c() - fisher.moments().log_c()).exp();
+        let growth = |r: &Rotation3<f64>| t.dot(r.matrix()).exp();
+        let exact = grid.integrate(|r| fisher.log_density(r).exp() * growth(r));
+        assert_relative_eq!(exact, ratio, max_relative = 1e-11);
+        let mut rng = ChaCha8Rng::seed_from_u64(11);
+        let n = 40_000;
+        let values: Vec<f64> =
+            fisher.sampler().sample_iter(&mut rng).take(n).map(|r| growth(&r)).collect();
+        let mean = values.iter().sum::<f64>() / n as f64;
+        let square = values.iter().map(|x| x * x).sum::<f64>() / n as f64;
+        let deviation = ((square - mean * mean) / n as f64).sqrt();
+        assert!((mean - ratio).abs() < 5.0 * deviation, "{mean} {ratio} {deviation}");
+    }
+}
+
+/// The 24 signed permutations of determinant one map a diagonal parameter to another.
+#[test]
+fn moments_are_permuted_and_signed_with_the_parameter() {
+    let s = [9.0, 4.0, -1.5];
+    let reference = MatrixFisher::new(&Matrix3::from_diagonal(&Vector3::from(s))).unwrap();
+    let orders = [[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [2, 1, 0], [1, 0, 2]];
+    for order in orders {
+        for signs in [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]] {
+            let permuted = Vector3::from_fn(|i, _| signs[i] * s[order[i]]);
+            let fisher = MatrixFisher::new(&Matrix3::from_diagonal(&permuted)).unwrap();
+            assert_relative_eq!(
+                fisher.moments().log_c(),
+                reference.moments().log_c(),
+                max_relative = 1e-14
+            );
+            let mean = fisher.mean();
+            for i in 0..3 {
+                let expected = signs[i] * reference.mean()[(order[i], order[i])];
+                assert_relative_eq!(mean[(i, i)], expected, max_relative = 1e-13);
+            }
+            // Odd permutations mirror both sides: second moments move all the same.
+            let second = fisher.second_moment()[(1, 3)];
+            let (i, j) = (order[0], order[1]);
+            let expected = signs[0] * signs[1] * reference.moments().second((i, j), (j, i));
+            assert_relative_eq!(second, expected, max_relative = 1e-12, epsilon = 1e-14);
+        }
     }
 }
 

@@ -11,6 +11,26 @@ use crate::so3::{ProperSvd, proper_svd};
 
 /// Moments that determine the conditional part once the attitude's distribution is known
 /// (3.24-3.26).
+///
+/// ```
+/// # use mfg_vio::distribution::matrix_fisher::MatrixFisher;
+/// # use mfg_vio::distribution::matrix_fisher_gaussian::{
+/// #     ConditionalMoments, Correlation, MatrixFisherGaussian,
+/// # };
+/// # use nalgebra::{Matrix1, Matrix1x3, Matrix3, Vector1, Vector3};
+/// // As a filter has them after a step: moments of a bias and its correlation with the attitude.
+/// let attitude = MatrixFisher::new(&Matrix3::from_diagonal_element(10.0))?;
+/// let moments = ConditionalMoments {
+///     mean: Vector1::new(0.5),
+///     deviation_mean: Vector3::zeros(),
+///     covariance: Matrix1::new(1.0),
+///     cross: Matrix1x3::new(1.7, 0.0, 0.0),
+///     deviation_covariance: Matrix3::from_diagonal_element(19.0),
+/// };
+/// let belief = MatrixFisherGaussian::from_moments(attitude, Correlation::Body, &moments)?;
+/// assert!((belief.p()[0] - 1.7 / 19.0).abs() < 1e-15);
+/// # Ok::<(), mfg_vio::distribution::matrix_fisher_gaussian::MfgError>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct ConditionalMoments<D: Dim>
 where
@@ -29,6 +49,27 @@ where
 }
 
 /// A sample of the attitude and the vector with its weight.
+///
+/// ```
+/// # use mfg_vio::distribution::matrix_fisher_gaussian::{
+/// #     Correlation, MatrixFisherGaussian, MfgError, WeightedSample,
+/// # };
+/// # use mfg_vio::so3::exp;
+/// # use nalgebra::{Const, Vector1, Vector3};
+/// // x follows rotations about the first axis; rotations about the others are unrelated to it.
+/// let turns = [0.2, -0.2].into_iter().flat_map(|angle| {
+///     (0..3).map(move |axis| WeightedSample {
+///         weight: 1.0,
+///         attitude: exp(&Vector3::ith(axis, angle)),
+///         x: Vector1::new(if axis == 0 { 5.0 * angle } else { 0.1 * angle.signum() }),
+///     })
+/// });
+/// let samples: Vec<WeightedSample<Const<1>>> = turns.collect();
+/// let belief = MatrixFisherGaussian::from_samples(&samples, Correlation::Body)?;
+/// let x = |axis| belief.conditional_mean(&exp(&Vector3::ith(axis, 0.2)))[0];
+/// assert!((x(0) - 1.0).abs() < 0.01 && x(1) < 0.11);
+/// # Ok::<(), MfgError>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct WeightedSample<D: Dim>
 where
@@ -41,6 +82,26 @@ where
 
 /// The Gaussian of `x` and the body-frame rotation vector `e` of `mode exp(e^)`, in which a
 /// concentrated matrix Fisher-Gaussian distribution ends (3.15).
+///
+/// ```
+/// # use mfg_vio::distribution::matrix_fisher_gaussian::{
+/// #     Correlation, MatrixFisherGaussian, MfgError, TangentGaussian,
+/// # };
+/// # use nalgebra::{Matrix1, Matrix1x3, Matrix3, Rotation3, Vector1};
+/// // What an error-state Kalman filter holds, as a distribution on the group and back.
+/// let gaussian = TangentGaussian {
+///     mode: Rotation3::identity(),
+///     mean: Vector1::new(0.0),
+///     covariance: Matrix1::new(1.0),
+///     cross: Matrix1x3::new(0.0, 0.002, 0.0),
+///     rotation: Matrix3::from_diagonal_element(1e-4),
+/// };
+/// let belief = MatrixFisherGaussian::from_gaussian(&gaussian, Correlation::World)?;
+/// let back = belief.to_gaussian()?;
+/// assert!((back.cross - gaussian.cross).norm() < 1e-15);
+/// assert!((back.rotation - gaussian.rotation).norm() < 1e-15);
+/// # Ok::<(), MfgError>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct TangentGaussian<D: Dim>
 where

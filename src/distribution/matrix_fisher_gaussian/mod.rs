@@ -5,11 +5,15 @@
 //! `(R, x) ~ MG(mu, Sigma, P, U, S, V)` if `R ~ M(U S V^T)` and, given `R`, `x` is Gaussian
 //! (definition 3.1):
 //!
-//! ```text
-//! x | R ~ N(mu + P v_R, Sigma_c),        Sigma_c = Sigma - P (tr(S) I - S) P^T,
-//! v_R = (Q S - S Q^T)^v   (world, MFGI)
-//! v_R = (S Q - Q^T S)^v   (body, MFGB),  Q = U^T R V.
+//! ```math
+//! x | R &\sim \mathcal{N}(\mu + P v_R, \Sigma_c), \qquad
+//!   \Sigma_c = \Sigma - P (\tr(S) I - S) P^\top , \\
+//! v_R &= (Q S - S Q^\top)^\vee \quad \text{(world, MFGI)} , \\
+//! v_R &= (S Q - Q^\top S)^\vee \quad \text{(body, MFGB)} , \qquad Q = U^\top R V .
 //! ```
+//!
+//! It is a Gaussian on the ambient space `R^9 x R^n`, conditioned on `R` being a rotation (theorem
+//! 3.2).
 //!
 //! `P` (n x 3) holds the linear correlation of `x` with rotations about the principal axes: it is
 //! the covariance of `x` with the rotation vector in those axes where the attitude is
@@ -20,9 +24,26 @@
 //! The vector `v_R` is linear in `vec R`, so that everything here is: [`regression`] gives the
 //! 3x9 matrix, and conditional mean, moments and estimates follow by linear algebra.
 //!
+//! # Moments and estimation
+//!
+//! `E[v_R] = 0`, and `v_R` has a diagonal covariance (theorem 3.5):
+//!
+//! ```math
+//! E[x] &= \mu , \qquad E[v_R v_R^\top] = \tr(S D) I - S D = \Delta , \\
+//! \mathrm{Cov}[x, v_R] &= P \Delta , \qquad \mathrm{Cov}[x] = \Sigma_c + P \Delta P^\top .
+//! ```
+//!
+//! Estimation goes backwards: the attitude from `E[R]`, then `P`, `mu` and `Sigma` by regression on
+//! `v_R` (theorem 3.6), from samples ([`from_samples`]) or from moments ([`from_moments`]). What
+//! this two-step estimate gives away is [`concentration_information`] (theorem 3.7).
+//!
 //! The dimension `n` is a type: fixed (`Const<15>`) or dynamic (`Dyn`).
 //!
 //! [`regression`]: MatrixFisherGaussian::regression
+//! [`from_samples`]: MatrixFisherGaussian::from_samples
+//! [`from_moments`]: MatrixFisherGaussian::from_moments
+//! [`concentration_information`]: MatrixFisherGaussian::concentration_information
+#![doc = include_str!("../../../docs/math.html")]
 
 mod estimation;
 
@@ -41,6 +62,19 @@ use crate::so3::{ProperSvd, exp, vee};
 pub use estimation::{ConditionalMoments, TangentGaussian, WeightedSample};
 
 /// The frame whose rotations `x` is correlated with.
+///
+/// ```
+/// # use mfg_vio::distribution::matrix_fisher_gaussian::Correlation;
+/// # use mfg_vio::so3::exp;
+/// # use nalgebra::Vector3;
+/// // A small turn about the first principal axis, as either variant measures it: s2 + s3 times
+/// // its angle.
+/// let (s, q) = (Vector3::new(30.0, 20.0, 10.0), exp(&(1e-3 * Vector3::x())));
+/// for correlation in [Correlation::World, Correlation::Body] {
+///     let v = correlation.deviation(&q, &s);
+///     assert!((v - Vector3::new(0.030, 0.0, 0.0)).norm() < 1e-8);
+/// }
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Correlation {
     /// MFGI: rotations act on the left, in the world (inertial) frame (3.3a).
@@ -134,6 +168,21 @@ where
 }
 
 /// First and second moments of `(R, x)` (theorem 3.5).
+///
+/// ```
+/// # use mfg_vio::distribution::matrix_fisher::MatrixFisher;
+/// # use mfg_vio::distribution::matrix_fisher_gaussian::{Correlation, MatrixFisherGaussian};
+/// # use nalgebra::{Matrix1, Matrix1x3, Matrix3, Vector1};
+/// let attitude = MatrixFisher::new(&Matrix3::from_diagonal_element(10.0))?;
+/// let (mu, sigma) = (Vector1::new(0.5), Matrix1::new(1.0));
+/// let p = Matrix1x3::new(0.1, 0.0, 0.0);
+/// let belief = MatrixFisherGaussian::new(attitude, mu, sigma, p, Correlation::Body)?;
+/// let moments = belief.moments();
+/// assert_eq!(moments.mean, mu);
+/// // Close to the parameter where the attitude is concentrated, below it elsewhere.
+/// assert!((0.98..1.0).contains(&moments.covariance[(0, 0)]));
+/// # Ok::<(), mfg_vio::distribution::matrix_fisher_gaussian::MfgError>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct MfgMoments<D: Dim>
 where
@@ -320,6 +369,39 @@ where
         Vector3::from_fn(|i, _| products[(i + 1) % 3] + products[(i + 2) % 3])
     }
 
+    /// Fisher information of each concentration `s_i`, `Sigma_c` being given: what the attitude
+    /// alone holds, and what `x` adds to it given the attitude. The estimate of the attitude from
+    /// `E[R]` gives the second part away; their ratio is (3.31) where `S = s I`.
+    ///
+    /// ```
+    /// # use mfg_vio::distribution::matrix_fisher::MatrixFisher;
+    /// # use mfg_vio::distribution::matrix_fisher_gaussian::{Correlation, MatrixFisherGaussian};
+    /// # use nalgebra::{Matrix1, Matrix1x3, Matrix3, Vector1};
+    /// let attitude = MatrixFisher::new(&Matrix3::from_diagonal_element(10.0))?;
+    /// let (mu, sigma) = (Vector1::new(0.0), Matrix1::new(1.0));
+    /// let p = Matrix1x3::new(0.02, 0.02, 0.02);
+    /// let belief = MatrixFisherGaussian::new(attitude, mu, sigma, p, Correlation::Body)?;
+    /// let [marginal, conditional] = belief.concentration_information();
+    /// // A correlation coefficient of 0.09 is worth less than a part in a hundred.
+    /// assert!(conditional[0] < 0.01 * marginal[0]);
+    /// # Ok::<(), mfg_vio::distribution::matrix_fisher_gaussian::MfgError>(())
+    /// ```
+    pub fn concentration_information(&self) -> [Vector3<f64>; 2] {
+        let moments = self.attitude.moments();
+        // P^T Sigma_c^-1 P.
+        let mut weighted = self.p.clone();
+        self.conditional.solve_mut(&mut weighted);
+        let gain = self.p.transpose() * weighted;
+        // Component i of v_R is s_j Q_kj - s_k Q_jk, or s_k Q_kj - s_j Q_jk in the body frame: s_i
+        // moves the other two, by entries whose product vanishes on average.
+        let square = |row: usize, column: usize| moments.second((row, column), (row, column));
+        let conditional = Vector3::from_fn(|i, _| {
+            let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+            gain[(j, j)] * square(k, i) + gain[(k, k)] * square(j, i)
+        });
+        [moments.diagonal_covariance().diagonal(), conditional]
+    }
+
     /// The distribution of `(R, x + x')` for an independent `x' ~ N(mu', Sigma')` (theorem 4.8).
     pub fn add_independent(
         &self,
@@ -430,6 +512,22 @@ where
 }
 
 /// Exact sampler of a matrix Fisher-Gaussian distribution.
+///
+/// ```
+/// # use mfg_vio::distribution::matrix_fisher::MatrixFisher;
+/// # use mfg_vio::distribution::matrix_fisher_gaussian::{Correlation, MatrixFisherGaussian};
+/// # use nalgebra::{Matrix3, Vector3};
+/// # use rand::{SeedableRng, distr::Distribution};
+/// let attitude = MatrixFisher::new(&Matrix3::from_diagonal_element(10.0))?;
+/// let (mu, sigma) = (Vector3::new(1.0, 2.0, 3.0), Matrix3::identity());
+/// let p = Matrix3::from_diagonal_element(0.1);
+/// let belief = MatrixFisherGaussian::new(attitude, mu, sigma, p, Correlation::World)?;
+/// let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
+/// let samples = belief.sampler().sample_iter(&mut rng).take(1000);
+/// let mean = samples.map(|(_, x)| x).sum::<Vector3<f64>>() / 1000.0;
+/// assert!((mean - mu).norm() < 0.1);
+/// # Ok::<(), mfg_vio::distribution::matrix_fisher_gaussian::MfgError>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct MfgSampler<'a, D: Dim>
 where

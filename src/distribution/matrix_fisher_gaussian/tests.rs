@@ -79,6 +79,43 @@ fn density_integrates_to_one_with_the_stated_moments() {
     }
 }
 
+/// Theorem 3.2: the distribution is a Gaussian in the ambient space `R^9 x R^n`, conditioned on
+/// `R` being a rotation; its regression and its conditional covariance are those of the Gaussian.
+#[test]
+fn it_is_a_gaussian_of_the_ambient_space_restricted_to_rotations() {
+    let vec = |m: Matrix3<f64>| SVector::<f64, 9>::from_column_slice(m.as_slice());
+    let r = *exp(&Vector3::new(1.0, 2.0, -0.5)).matrix();
+    for s in [[5.0, 2.0, -1.0], [30.0, 4.0, 2.0]] {
+        for correlation in VARIANTS {
+            let belief = belief(s, correlation);
+            let ProperSvd { u, s, v } = *belief.attitude().svd();
+            let m = *belief.attitude().mode().matrix();
+            let diagonal = Matrix3::from_diagonal(&s);
+            let tangent = |i: usize| m * crate::so3::hat(&v.matrix().column(i).into_owned());
+            let (deviation, k, t) = match correlation {
+                Correlation::World => (
+                    vec((r - m).transpose()),
+                    v.matrix() * diagonal * v.matrix().transpose(),
+                    [0, 1, 2].map(|i| vec(tangent(i).transpose())),
+                ),
+                Correlation::Body => (
+                    vec(r - m),
+                    u.matrix() * diagonal * u.matrix().transpose(),
+                    [0, 1, 2].map(|i| vec(tangent(i))),
+                ),
+            };
+            let information = Matrix3::<f64>::identity().kronecker(&k);
+            let t = SMatrix::<f64, 9, 3>::from_columns(&t);
+            let v_r = t.transpose() * information * deviation;
+            let attitude = Rotation3::from_matrix_unchecked(r);
+            assert!((v_r - belief.deviation(&attitude)).norm() < 1e-12, "{correlation:?}");
+            let removed = t.transpose() * information * t;
+            let expected = Matrix3::from_diagonal(&belief.tangent_information());
+            assert!((removed - expected).norm() < 1e-12, "{correlation:?}");
+        }
+    }
+}
+
 #[test]
 fn log_density_is_that_of_the_two_parts() {
     let belief = belief([3.0, 2.0, 1.0], Correlation::World);
@@ -90,6 +127,43 @@ fn log_density_is_that_of_the_two_parts() {
         - 0.5 * (covariance * std::f64::consts::TAU).determinant().ln();
     let expected = belief.attitude().log_density(&r) + gaussian;
     assert!((belief.log_density(&r, &x) - expected).abs() < 1e-12);
+}
+
+/// The general form by quadrature of the score of the conditional density, and theorem 3.7.
+#[test]
+fn concentration_information_is_that_of_both_parts() {
+    let grid = HaarQuadrature::of_degree(40);
+    for correlation in VARIANTS {
+        let belief = belief([3.0, 2.0, -1.0], correlation);
+        let inverse = belief.conditional_covariance().try_inverse().unwrap();
+        let [marginal, conditional] = belief.concentration_information();
+        for i in 0..3 {
+            let unit = Vector3::ith(i, 1.0);
+            let expectation = |f: &dyn Fn(&Rotation3<f64>) -> f64| {
+                grid.integrate(|r| belief.attitude().log_density(r).exp() * f(r))
+            };
+            let of_x = expectation(&|r| {
+                let q = belief.attitude().centred(r);
+                let slope = belief.p() * correlation.deviation(&q, &unit);
+                slope.dot(&(inverse * slope))
+            });
+            assert!((conditional[i] - of_x).abs() < 1e-11 * of_x.max(1.0), "{of_x}");
+            let d = belief.attitude().moments().first();
+            let of_r = expectation(&|r| (belief.attitude().centred(r)[(i, i)] - d[i]).powi(2));
+            assert!((marginal[i] - of_r).abs() < 1e-11);
+        }
+
+        let (s, rho, sigma) = (4.0, 0.3, 1.7);
+        let attitude = attitude([s; 3]);
+        let p = OMatrix::<f64, Const<1>, U3>::repeat(rho * sigma / (2.0 * s).sqrt());
+        let (mu, variance) = (SVector::<f64, 1>::zeros(), SMatrix::<f64, 1, 1>::new(sigma * sigma));
+        let belief = MatrixFisherGaussian::new(attitude, mu, variance, p, correlation).unwrap();
+        let [marginal, conditional] = belief.concentration_information();
+        let moments = belief.attitude().moments();
+        let (d, dd) = (moments.first()[0], moments.second((0, 0), (0, 0)));
+        let ratio = (1.0 - 3.0 * rho * rho) / (rho * rho) * 2.0 * s * (dd - d * d) / (1.0 - dd);
+        assert!((marginal[0] / conditional[0] / ratio - 1.0).abs() < 1e-12, "{ratio}");
+    }
 }
 
 #[test]
