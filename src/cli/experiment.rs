@@ -1,4 +1,5 @@
-use std::path::PathBuf;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
@@ -26,7 +27,7 @@ pub struct ExperimentArgs {
     /// Threads; one a core if not given. The result does not depend on it.
     #[arg(long, value_name = "N", default_value_t = 0)]
     threads: usize,
-    /// Write the report (JSON) and the figures (SVG) here.
+    /// Write the report (JSON) and its figures (SVG and PNG) here.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Print one JSON object.
@@ -40,8 +41,7 @@ pub fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
         for study in experiment::studies() {
             table.push([study.name.to_owned(), study.runs.to_string(), study.title.to_owned()]);
         }
-        print!("{}", table.to_text());
-        return Ok(());
+        return Ok(std::io::stdout().write_all(table.to_text().as_bytes())?);
     }
     let name = args.name.as_deref().unwrap_or_default();
     let study = experiment::find(name).with_context(|| unknown(name))?;
@@ -55,18 +55,29 @@ pub fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
     let report = pool.install(|| (study.run)(&request))?;
     bar.finish_and_clear();
     if let Some(directory) = &args.out {
-        std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
-        let path = directory.join(format!("{}.json", report.name));
-        std::fs::write(&path, serde_json::to_string(&report)?)
-            .with_context(|| path.display().to_string())?;
+        write(&report, directory)?;
     }
-    if args.json {
-        println!("{}", serde_json::to_string(&report)?);
+    let output = if args.json {
+        serde_json::to_string(&report)?
     } else {
-        println!("{}: {} ({} runs, seed {})", study.name, study.title, report.runs, report.seed);
-        print!("{}", table(&report).to_text());
-        for note in &report.notes {
-            println!("{note}");
+        let (name, title) = (study.name, study.title);
+        let heading = format!("{name}: {title} ({} runs, seed {})", report.runs, report.seed);
+        let lines = [heading, table(&report).to_text().trim_end().to_owned()];
+        lines.into_iter().chain(report.notes).collect::<Vec<_>>().join("\n")
+    };
+    Ok(writeln!(std::io::stdout(), "{output}")?)
+}
+
+/// `NAME.json`, and each figure as `NAME.svg` and `NAME.png`, numbered where there are several.
+fn write(report: &Report, directory: &Path) -> anyhow::Result<()> {
+    std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
+    let path = directory.join(format!("{}.json", report.name));
+    std::fs::write(&path, serde_json::to_string(report)?)
+        .with_context(|| path.display().to_string())?;
+    for (n, figure) in report.figures.iter().enumerate() {
+        let number = if report.figures.len() > 1 { format!("-{}", n + 1) } else { String::new() };
+        for extension in ["svg", "png"] {
+            figure.save(&directory.join(format!("{}{number}.{extension}", report.name)))?;
         }
     }
     Ok(())

@@ -11,7 +11,6 @@ pub mod matrix_fisher;
 mod study;
 mod visual;
 
-pub use matrix_fisher::{Curve, Figure};
 pub use study::{
     Observation, PaperValue, Report, Request, Row, StepTime, Study, StudyError, Trial, monte_carlo,
 };

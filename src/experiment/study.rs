@@ -8,8 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::Figure;
-use crate::evaluation::paired_t_test;
+use crate::evaluation::{Figure, paired_t_test};
 
 /// A numerical study of one of the papers, or of our own.
 #[derive(Debug, Clone, Copy)]
@@ -97,6 +96,22 @@ pub struct Row {
     pub p_vs: BTreeMap<String, f64>,
     /// CPU time of one step, ns; `None` where it was not measured.
     pub step_time_ns: Option<f64>,
+}
+
+impl Row {
+    /// A number without statistics.
+    pub fn of_value(case: &str, filter: &str, quantity: &str, value: f64) -> Self {
+        Self {
+            case: case.to_owned(),
+            filter: filter.to_owned(),
+            quantity: quantity.to_owned(),
+            mean: value,
+            sd: 0.0,
+            paper: None,
+            p_vs: BTreeMap::new(),
+            step_time_ns: None,
+        }
+    }
 }
 
 /// The result of a study.
