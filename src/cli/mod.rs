@@ -6,6 +6,7 @@ mod convert;
 mod demo;
 mod evaluate;
 mod experiment;
+mod fisher;
 mod gnss;
 mod info;
 #[cfg(feature = "vision")]
@@ -41,6 +42,7 @@ enum Command {
     Info(info::Args),
     Evaluate(evaluate::EvaluateArgs),
     Experiment(experiment::ExperimentArgs),
+    Fisher(fisher::FisherArgs),
     Gnss(gnss::GnssArgs),
 }
 
@@ -59,6 +61,7 @@ pub fn main() -> ExitCode {
         Command::Info(args) => info::run(&args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Experiment(args) => experiment::run(&args),
+        Command::Fisher(args) => fisher::run(&args),
         Command::Gnss(args) => gnss::run(&args),
     };
     match done {
