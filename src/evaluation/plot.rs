@@ -148,6 +148,19 @@ fn viridis(fraction: f64) -> RGBColor {
 }
 
 impl Figure {
+    /// One panel of curves over logarithmic axes.
+    pub fn logarithmic(title: &str, x_label: &str, y_label: &str, curves: Vec<Curve>) -> Self {
+        let panel = CurvePanel {
+            x_label: x_label.to_owned(),
+            y_label: y_label.to_owned(),
+            curves,
+            x_scale: Scale::Logarithmic,
+            y_scale: Scale::Logarithmic,
+            ..Default::default()
+        };
+        Self { title: title.to_owned(), panels: vec![Panel::Curves(panel)], columns: 1 }
+    }
+
     /// The same figure with `name` before its title.
     pub fn titled(mut self, name: &str) -> Self {
         self.title = format!("{name}: {}", self.title);

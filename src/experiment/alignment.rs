@@ -14,8 +14,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::{
-    Curve, Figure, Observation, PaperValue, Report, Request, StepTime, Study, StudyError, Trial,
-    monte_carlo,
+    Observation, PaperValue, Report, Request, StepTime, Study, StudyError, Trial, monte_carlo,
 };
 use crate::alignment::{
     AlignmentError, LeastSquaresConfig, LeastSquaresPose, MapEstimate, PointPair, PosePosterior,
@@ -23,6 +22,7 @@ use crate::alignment::{
 };
 use crate::distribution::progressive::ProgressiveConfig;
 use crate::distribution::rotation_quadratic::vectorize;
+use crate::evaluation::{Curve, Figure};
 use crate::so3::log;
 
 /// Sections 5.2.2 and 5.2.4 of W22 without filters.
@@ -115,16 +115,15 @@ fn figure_5_3(report: &Report) -> Figure {
             })
         };
         let points =
-            FIGURE_5_3.iter().filter_map(|(_, label, n)| Some((*n, mean(label)?.mean))).collect();
-        Curve { label: filter, points }
+            FIGURE_5_3.iter().filter_map(|(_, label, n)| Some([*n, mean(label)?.mean])).collect();
+        Curve { name: filter.to_owned(), points }
     };
-    Figure {
-        number: "5.3",
-        title: "Divergence from the posterior of the pose",
-        x_label: "points",
-        y_label: "KL divergence, nats",
-        curves: ["mfg", "mfg-paper", "lm"].map(curve).into(),
-    }
+    Figure::logarithmic(
+        "Figure 5.3: divergence from the posterior of the pose",
+        "points",
+        "KL divergence, nats",
+        ["mfg", "mfg-paper", "lm"].map(curve).into(),
+    )
 }
 
 fn table_5_14(request: &Request) -> Result<Report, StudyError> {
@@ -501,6 +500,7 @@ const TABLE_5_14: &[[PaperValue; 3]] = &[
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::evaluation::Panel;
     use rand::SeedableRng;
     use std::sync::atomic::AtomicBool;
 
@@ -535,7 +535,8 @@ mod tests {
         assert!((1.0..6.0).contains(&nees), "{nees}");
         let [mfg, lm] = ["mfg", "lm"].map(|filter| mean(&report, "N=3", filter, "kl_nats"));
         assert!(0.0 < mfg && mfg < lm, "{mfg} {lm}");
-        assert_eq!(report.figures[0].curves.len(), 3);
+        let [Panel::Curves(panel)] = &report.figures[0].panels[..] else { panic!("one panel") };
+        assert_eq!(panel.curves.len(), 3);
     }
 
     #[test]

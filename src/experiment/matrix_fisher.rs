@@ -11,7 +11,7 @@ use super::{Report, Request, Row, Study, StudyError};
 use crate::distribution::matrix_fisher::{
     ApproximateMoments, HigherMomentError, HigherMoments, MatrixFisher, MatrixFisherError, Moments,
 };
-use crate::evaluation::{Curve, CurvePanel, Figure, Panel, Scale};
+use crate::evaluation::{Curve, Figure, Panel};
 use crate::so3::HaarQuadrature;
 
 /// Chapter 2.
@@ -306,7 +306,7 @@ fn figure_2_1(request: &Request) -> Result<Report, MatrixFisherStudyError> {
     }
     let curves: Vec<Curve> = curves.into_iter().chain([pass]).collect();
     let title = "Moments as s3 approaches s2 (s1 = 25, s2 = 10)";
-    let figure = logarithmic_figure(title, "s2 - s3", "largest relative error", curves);
+    let figure = Figure::logarithmic(title, "s2 - s3", "largest relative error", curves);
     let rows = rows_of(&figure, "gap", "relative_error", 2);
     Ok(report("wang-fig-2.1", request, rows, figure))
 }
@@ -417,7 +417,7 @@ fn approximations(
             curve.points.push([x, value]);
         }
     }
-    let figure = logarithmic_figure(shown.title, "s", shown.label, curves.into());
+    let figure = Figure::logarithmic(shown.title, "s", shown.label, curves.into());
     let mut rows = rows_of(&figure, "s", shown.quantity, PER_DECADE);
     if shown.quantity == "log_c" {
         rows.iter_mut().for_each(|row| row.mean = row.mean.ln());
@@ -427,18 +427,6 @@ fn approximations(
 
 fn curve(name: &str) -> Curve {
     Curve { name: name.to_owned(), points: Vec::new() }
-}
-
-fn logarithmic_figure(title: &str, x_label: &str, y_label: &str, curves: Vec<Curve>) -> Figure {
-    let panel = CurvePanel {
-        x_label: x_label.to_owned(),
-        y_label: y_label.to_owned(),
-        curves,
-        x_scale: Scale::Logarithmic,
-        y_scale: Scale::Logarithmic,
-        ..Default::default()
-    };
-    Figure { title: title.to_owned(), panels: vec![Panel::Curves(panel)], columns: 1 }
 }
 
 /// Each curve at every `stride`-th abscissa.
