@@ -185,8 +185,8 @@ mod tests {
         };
         let gyro = GyroModel::isotropic(1e-3, 1e-5);
         let mut turned = kind.start(&gyro, &prior).unwrap();
-        for _ in 0..20 {
-            let step = InertialStep::turning(Vector3::new(0.3, -0.2, 0.5), 0.1);
+        for _ in 0..200 {
+            let step = InertialStep::turning(Vector3::new(0.3, -0.2, 0.5), 0.01);
             turned.propagate(&step).unwrap();
         }
         (kind.start(&gyro, &prior).unwrap(), turned)
