@@ -72,7 +72,7 @@ fn updates(c: &mut Criterion) {
         for count in POINTS {
             let pairs = pairs(count);
             let mut filter = kind.start(&FilterConfig::default(), propagator.clone(), belief());
-            // The belief is set back by inflating it: an update costs the same at any belief.
+            // Repeated updates let the belief settle, as that of a running filter is.
             c.bench_with_input(
                 BenchmarkId::new(format!("update/{kind}"), count),
                 &pairs,

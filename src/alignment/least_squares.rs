@@ -95,3 +95,56 @@ fn damped(information: &Matrix6<f64>, damping: f64) -> Matrix6<f64> {
     let raised = diagonal.map(|d| damping * d + floor);
     information + Matrix6::from_diagonal(&Vector6::from(raised))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::alignment::{WeightedPair, weighted_kabsch};
+    use nalgebra::Matrix3;
+
+    fn pair(in_body: Vector3<f64>, error: Vector3<f64>) -> PointPair {
+        let rotation = Rotation3::new(Vector3::new(0.4, -0.2, 0.9));
+        PointPair {
+            in_body,
+            body_covariance: Matrix3::identity() * 0.01,
+            in_world: rotation * in_body + Vector3::new(5.0, 1.0, -2.0) + error,
+            world_covariance: Matrix3::identity() * 0.02,
+        }
+    }
+
+    #[test]
+    fn it_finds_the_closed_form_from_afar() {
+        let pairs: Vec<_> = (0..8u32)
+            .map(|i| {
+                let phase = f64::from(i);
+                let point = Vector3::new(phase.sin(), (2.0 * phase).cos(), 0.3 * phase);
+                pair(point, Vector3::repeat(0.1 * (5.0 * phase).sin()))
+            })
+            .collect();
+        let weighted = pairs.iter().map(|pair| WeightedPair {
+            from: pair.in_body,
+            to: pair.in_world,
+            weight: 1.0,
+        });
+        let closed = weighted_kabsch(weighted).unwrap();
+        let config = LeastSquaresConfig::default();
+        let found =
+            optimize_pose(&pairs, &Rotation3::identity(), &Vector3::zeros(), &config).unwrap();
+        let apart = closed.rotation.to_rotation_matrix().angle_to(&found.rotation);
+        assert!(apart < 1e-7, "{apart}");
+        assert!((closed.translation.vector - found.position).norm() < 1e-7);
+        assert!(found.covariance().is_some() && found.iterations < 50);
+    }
+
+    #[test]
+    fn an_undetermined_pose_has_a_minimum_and_no_covariance() {
+        let line = [0.0, 1.0, 2.0].map(|x| pair(Vector3::new(x, 0.0, 0.0), Vector3::zeros()));
+        let config = LeastSquaresConfig::default();
+        let found =
+            optimize_pose(&line, &Rotation3::identity(), &Vector3::zeros(), &config).unwrap();
+        assert!(found.cost < 1e-12, "{}", found.cost);
+        let spread = found.covariance().map_or(f64::INFINITY, |covariance| covariance.amax());
+        assert!(spread > 1e6, "{spread}");
+        assert_eq!(optimize_pose(&[], &found.rotation, &found.position, &config), None);
+    }
+}
