@@ -39,6 +39,9 @@ fn proposal(pairs: &[PointPair]) -> Matrix3<f64> {
     let count = n.saturating_sub(1);
     let equal = variances.iter().all(|v| (v - variances[0]).abs() <= 1e-12 * v);
     let mut f = Matrix3::zeros();
+    if count == 0 {
+        return f;
+    }
     let mut add = |r: Vector3<f64>, measured: Vector3<f64>, variance: f64| {
         // A direction without length or noise of infinite size says nothing.
         let Ok(fisher) = VonMisesFisher::from_projected_normal(r, variance) else { return };
