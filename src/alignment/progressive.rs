@@ -80,49 +80,17 @@ fn isotropic_variance(pair: &PointPair) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alignment::align;
 
-    /// Points along the axes of a box, seen from a pose, with the given variances.
-    fn pairs(variance: impl Fn(u32) -> f64) -> Vec<PointPair> {
-        let rotation = Rotation3::new(Vector3::new(0.4, -0.2, 0.9));
-        let pair = |i: u32| {
-            let sign = if i % 2 == 0 { 1.0 } else { -1.0 };
-            let mut in_body = Vector3::zeros();
-            in_body[(i / 2) as usize % 3] = sign * (1.0 + f64::from(i) / 20.0);
-            PointPair {
-                in_body,
-                body_covariance: Matrix3::identity() * variance(i),
-                in_world: rotation * in_body + Vector3::new(5.0, 1.0, -2.0),
-                world_covariance: Matrix3::zeros(),
-            }
+    #[test]
+    fn a_single_point_leaves_the_attitude_uniform() {
+        let pair = PointPair {
+            in_body: Vector3::x(),
+            body_covariance: Matrix3::identity() * 0.01,
+            in_world: Vector3::y(),
+            world_covariance: Matrix3::zeros(),
         };
-        (0..12).map(pair).collect()
-    }
-
-    #[test]
-    fn it_comes_close_to_the_exact_posterior() {
-        let mixed = |i: u32| if i < 6 { 0.02 } else { 0.1 };
-        for pairs in [pairs(|_| 0.04), pairs(mixed)] {
-            let exact = align(&pairs).unwrap();
-            let config = ProgressiveConfig { least_ratio: 0.5, ..ProgressiveConfig::default() };
-            let found = align_progressively(&pairs, &config).unwrap();
-            let attitude = |posterior: &PosePosterior| *posterior.pose.attitude();
-            assert!(attitude(&found).mode().angle_to(&attitude(&exact).mode()) < 1e-2);
-            let trace =
-                |posterior: &PosePosterior| attitude(posterior).rotation_covariance().trace();
-            let ratio = trace(&found) / trace(&exact);
-            assert!((0.7..1.4).contains(&ratio), "{ratio}");
-            assert!((found.pose.mu() - exact.pose.mu()).norm() < 0.02);
-        }
-    }
-
-    #[test]
-    fn degenerate_points_are_no_error() {
-        let all = pairs(|_| 0.01);
-        for count in 1..=3 {
-            let found = align_progressively(&all[..count], &ProgressiveConfig::default()).unwrap();
-            assert!(found.pose.mu().iter().all(|x| x.is_finite()));
-        }
+        let found = align_progressively(&[pair], &ProgressiveConfig::default()).unwrap();
+        assert!(found.pose.attitude().parameter().norm() < 1e-9);
         let nothing = align_progressively(&[], &ProgressiveConfig::default());
         assert_eq!(nothing.err(), Some(AlignmentError::NoPoints));
     }
