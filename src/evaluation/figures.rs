@@ -3,6 +3,7 @@
 use nalgebra::{Isometry3, Vector3};
 
 use super::plot::{Band, BoxPanel, Curve, CurvePanel, Figure, Panel, PathPanel};
+use super::statistics::quantile;
 use super::{NeesResult, NeesSummary, PosePairs, SubTrajectoryError};
 
 /// Lines are interrupted where stamps are further apart, s.
@@ -72,6 +73,7 @@ pub fn belief_figure(result: &NeesResult) -> Figure {
         let errors: Vec<f64> = errors.iter().map(|e| factor * e[axis]).collect();
         let sigmas: Vec<f64> = sigmas.iter().map(|s| 3.0 * factor * s[axis]).collect();
         let points = series(&result.stamps, &sigmas);
+        let largest = errors.iter().map(|error| error.abs()).fold(settled(&sigmas), f64::max);
         Panel::Curves(CurvePanel {
             title: format!("{kind} {}", names[axis]),
             x_label: "time (s)".to_owned(),
@@ -84,6 +86,7 @@ pub fn belief_figure(result: &NeesResult) -> Figure {
                 name: "error".to_owned(),
                 points: series(&result.stamps, &errors),
             }],
+            limits: Some([-largest, largest]),
             ..Default::default()
         })
     };
@@ -101,6 +104,14 @@ pub fn belief_figure(result: &NeesResult) -> Figure {
     }
 }
 
+/// Largest bound but for the widest twentieth: what a filter starts with falls by orders of
+/// magnitude within a few frames, and would leave nothing to be seen of the rest.
+fn settled(bounds: &[f64]) -> f64 {
+    let mut sorted = bounds.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    quantile(&sorted, 0.95)
+}
+
 /// NEES over time with its chi-square band.
 pub fn nees_figure(result: &NeesResult) -> Figure {
     let panel = |title: &str, values: &[f64], summary: &NeesSummary| {
@@ -116,7 +127,7 @@ pub fn nees_figure(result: &NeesResult) -> Figure {
                 points: ends.map(|t| [t - start, low, high]).collect(),
             }],
             curves: vec![Curve { name: "NEES".to_owned(), points: series(&result.stamps, values) }],
-            y_max: Some(20.0 * high),
+            limits: Some([0.0, 20.0 * high]),
             ..Default::default()
         })
     };

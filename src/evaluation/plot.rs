@@ -62,8 +62,8 @@ pub struct CurvePanel {
     /// Shaded below the curves.
     pub bands: Vec<Band>,
     pub curves: Vec<Curve>,
-    /// Largest value shown, where the curves go far beyond what is of interest.
-    pub y_max: Option<f64>,
+    /// Least and largest value shown, where curves or bands go far beyond what is of interest.
+    pub limits: Option<[f64; 2]>,
     pub x_scale: Scale,
     pub y_scale: Scale,
 }
@@ -458,19 +458,20 @@ impl Canvas {
         let curve_points = || panel.curves.iter().flat_map(|curve| &curve.points);
         let x = band_points().map(|p| p[0]).chain(curve_points().map(|p| p[0]));
         let y = band_points().flat_map(|p| [p[1], p[2]]).chain(curve_points().map(|p| p[1]));
-        let y_max = panel.y_max.unwrap_or(f64::INFINITY);
+        let [least, largest] = panel.limits.unwrap_or([f64::NEG_INFINITY, f64::INFINITY]);
+        let clip = |value: f64| value.clamp(least, largest);
         let x = Axis::of(x, panel.x_scale, |range| range);
-        let y = Axis::of(y.map(|value| value.min(y_max)), panel.y_scale, padded);
+        let y = Axis::of(y.map(clip), panel.y_scale, padded);
         let labels = [panel.x_label.as_str(), panel.y_label.as_str()];
         let mut chart = self.chart(area, &panel.title, labels, [x, y], false)?;
         let mut names = 0;
         for (band, color) in panel.bands.iter().zip(COLORS.iter().cycle()) {
             let color = color.mix(0.18);
-            let points: Vec<_> =
-                band.points.iter().map(|p| [x.shown(p[0]), y.shown(p[1]), y.shown(p[2])]).collect();
+            let clipped = |p: &[f64; 3]| [x.shown(p[0]), y.shown(clip(p[1])), y.shown(clip(p[2]))];
+            let points: Vec<_> = band.points.iter().map(clipped).collect();
             for (k, run) in runs(&points).enumerate() {
-                let upper = thinned(run).map(|p| (p[0], p[2].min(y_max)));
-                let lower: Vec<_> = thinned(run).map(|p| (p[0], p[1].min(y_max))).collect();
+                let upper = thinned(run).map(|p| (p[0], p[2]));
+                let lower: Vec<_> = thinned(run).map(|p| (p[0], p[1])).collect();
                 let outline: Vec<_> = upper.chain(lower.into_iter().rev()).collect();
                 let shape = std::iter::once(Polygon::new(outline, color.filled()));
                 let series = chart.draw_series(shape).map_err(drawing)?;
@@ -487,9 +488,9 @@ impl Canvas {
         for (curve, color) in panel.curves.iter().zip(COLORS.iter().cycle()) {
             let style = self.line(*color, 1);
             let points: Vec<_> =
-                curve.points.iter().map(|p| [x.shown(p[0]), y.shown(p[1])]).collect();
+                curve.points.iter().map(|p| [x.shown(p[0]), y.shown(clip(p[1]))]).collect();
             for (k, run) in runs(&points).enumerate() {
-                let points = thinned(run).map(|p| (p[0], p[1].min(y_max)));
+                let points = thinned(run).map(|p| (p[0], p[1]));
                 let series = chart.draw_series(LineSeries::new(points, style)).map_err(drawing)?;
                 if k == 0 && !curve.name.is_empty() {
                     let size = self.px(16) as i32;

@@ -23,7 +23,7 @@ const STYLE: &str = "body{font:15px/1.5 system-ui,sans-serif;max-width:1320px;ma
 padding:0 1em;color:#222}h1{font-size:1.5em}h2{font-size:1.15em;margin-top:1.6em}\
 table{border-collapse:collapse;font-variant-numeric:tabular-nums}\
 th,td{padding:.2em .8em;border-bottom:1px solid #ddd;text-align:right}\
-td.text,th:first-child{text-align:left}.warning{background:#fff3cd;padding:.4em .8em;margin:.3em 0}\
+td.text,th.text{text-align:left}.warning{background:#fff3cd;padding:.4em .8em;margin:.3em 0}\
 figure{margin:1em 0}svg{max-width:100%;height:auto}";
 
 /// Writes `report` as one HTML file without references to others.

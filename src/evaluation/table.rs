@@ -142,16 +142,18 @@ impl Table {
     /// An HTML `table`.
     pub fn to_html(&self) -> String {
         let mut out = String::from("<table>\n<tr>");
-        for name in &self.columns {
+        let class = |cell: &Cell| if cell.is_text() { "text" } else { "number" };
+        for (index, name) in self.columns.iter().enumerate() {
+            let class = self.rows.first().and_then(|row| row.get(index)).map_or("number", class);
             // Writing to a string cannot fail.
-            let _ = write!(out, "<th>{}</th>", html_escaped(name));
+            let _ = write!(out, "<th class=\"{class}\">{}</th>", html_escaped(name));
         }
         out.push_str("</tr>\n");
         for row in &self.rows {
             out.push_str("<tr>");
             for cell in row {
-                let class = if cell.is_text() { "text" } else { "number" };
-                let _ = write!(out, "<td class=\"{class}\">{}</td>", html_escaped(&cell.display()));
+                let text = html_escaped(&cell.display());
+                let _ = write!(out, "<td class=\"{}\">{text}</td>", class(cell));
             }
             out.push_str("</tr>\n");
         }

@@ -4,8 +4,8 @@
 use nalgebra::{Isometry3, Matrix6, Rotation3, Vector3};
 use rerun::components::Radius;
 use rerun::{
-    Arrows3D, Boxes2D, Image, Mesh3D, Points2D, RecordingStream, RecordingStreamResult,
-    TriangleIndices, ViewCoordinates,
+    Arrows3D, Boxes2D, Image, Points2D, Points3D, RecordingStream, RecordingStreamResult,
+    ViewCoordinates,
 };
 
 use super::scene::point;
@@ -16,7 +16,8 @@ use crate::inertial::Belief;
 use crate::odometry::StepReport;
 use crate::so3::ProperSvd;
 
-/// A sphere of the world's directions, colored by where the body axes may point.
+/// The sphere of the world's directions, colored by where the body axes may point: points, so that
+/// one sees through to the far side.
 pub(super) const ATTITUDE: &str = "belief/attitude";
 const DENSITY: &str = "belief/attitude/density";
 const ESTIMATE: &str = "belief/attitude/estimate";
@@ -32,6 +33,8 @@ const DIVISIONS: u32 = 4;
 /// Narrower densities are drawn with this standard deviation, so that they do not fall between
 /// the vertices, rad.
 const NARROWEST: f64 = 0.052;
+/// Radii of the points where no axis may point and where one is most likely to.
+const POINT_RADII: [f32; 2] = [0.006, 0.025];
 /// Shades of the body's x, y and z axis.
 const SHADES: [[f64; 3]; 3] = [[235.0, 80.0, 70.0], [90.0, 215.0, 90.0], [80.0, 140.0, 255.0]];
 const SPHERE_COLOR: [f64; 3] = [52.0, 56.0, 66.0];
@@ -57,10 +60,8 @@ pub(super) fn log_styles(
     truth: bool,
 ) -> RecordingStreamResult<()> {
     stream.log_static(ATTITUDE, &ViewCoordinates::RIGHT_HAND_Z_UP())?;
-    let mesh = Mesh3D::update_fields()
-        .with_vertex_positions(sphere.vertices.iter().map(point))
-        .with_triangle_indices(sphere.triangles.iter().map(|t| TriangleIndices((*t).into())));
-    stream.log_static(DENSITY, &mesh)?;
+    let points = Points3D::update_fields().with_positions(sphere.vertices.iter().map(point));
+    stream.log_static(DENSITY, &points)?;
     let arrows = Arrows3D::update_fields()
         .with_colors(SHADES.map(|shade| shade.map(|channel| channel as u8)))
         .with_radii([Radius::new_scene_units(0.012)])
@@ -77,10 +78,11 @@ pub(super) fn log_styles(
 
 fn log_correlation_styles(stream: &RecordingStream) -> RecordingStreamResult<()> {
     let places = (0..6).map(|k| k as f32 + 0.5);
-    let names = Points2D::new(places.clone().map(|y| [-0.4, y]).chain(places.map(|x| [x, -0.3])))
-        .with_labels(COMPONENTS.into_iter().chain(COMPONENTS))
-        .with_show_labels(true)
-        .with_radii([Radius::new_ui_points(0.0)]);
+    let names =
+        Points2D::new(places.clone().map(|y| [-0.5, y - 0.2]).chain(places.map(|x| [x, -0.7])))
+            .with_labels(COMPONENTS.into_iter().chain(COMPONENTS))
+            .with_show_labels(true)
+            .with_radii([Radius::new_ui_points(0.0)]);
     stream.log_static(CORRELATION_NAMES, &names)?;
     let block = Boxes2D::from_mins_and_sizes([[3.0, 0.0]], [[3.0, 3.0]])
         .with_colors([TRUTH_COLOR])
@@ -96,8 +98,11 @@ pub(super) fn log(
     truth: Option<&Isometry3<f64>>,
 ) -> RecordingStreamResult<()> {
     if let Some(attitude) = attitude(report) {
-        let colors = density_colors(&displayed(&attitude), sphere);
-        stream.log(DENSITY, &Mesh3D::update_fields().with_vertex_colors(colors))?;
+        let densities = relative_densities(&displayed(&attitude), sphere);
+        let points = Points3D::update_fields()
+            .with_colors(densities.iter().map(blended))
+            .with_radii(densities.iter().map(radius));
+        stream.log(DENSITY, &points)?;
     }
     let estimate = report.state.world_from_body.rotation.to_rotation_matrix();
     stream.log(ESTIMATE, &axes(&estimate, ESTIMATE_LENGTH))?;
@@ -134,9 +139,8 @@ fn displayed(attitude: &MatrixFisher) -> MatrixFisher {
     MatrixFisher::from_svd(ProperSvd { s, ..*svd }).unwrap_or(*attitude)
 }
 
-/// Colors of the sphere's vertices: each axis adds its shade in proportion to its marginal
-/// density there, relative to its largest.
-fn density_colors(attitude: &MatrixFisher, sphere: &Sphere) -> Vec<[u8; 3]> {
+/// Marginal densities of the body axes at the sphere's vertices, each relative to its largest.
+fn relative_densities(attitude: &MatrixFisher, sphere: &Sphere) -> Vec<[f64; 3]> {
     let mode = attitude.mode();
     let mut shares = vec![[0.0; 3]; sphere.vertices.len()];
     for axis in 0..3 {
@@ -156,12 +160,13 @@ fn density_colors(attitude: &MatrixFisher, sphere: &Sphere) -> Vec<[u8; 3]> {
             share[axis] = log.map_or(0.0, |log| (log - largest).exp());
         }
     }
-    shares.iter().map(blended).collect()
+    shares
 }
 
 /// Exponent at which a density has vanished to the eye.
 const INVISIBLE: f64 = 12.0;
 
+/// Each axis adds its shade in proportion to its share.
 fn blended(shares: &[f64; 3]) -> [u8; 3] {
     let rest = shares.iter().fold(1.0, |rest, share| rest * (1.0 - share));
     std::array::from_fn(|channel| {
@@ -169,6 +174,12 @@ fn blended(shares: &[f64; 3]) -> [u8; 3] {
             shares.iter().zip(SHADES).map(|(share, shade)| share * shade[channel]).sum();
         (rest * SPHERE_COLOR[channel] + shades).round().clamp(0.0, 255.0) as u8
     })
+}
+
+fn radius(shares: &[f64; 3]) -> Radius {
+    let [least, largest] = POINT_RADII;
+    let share = shares.iter().copied().fold(0.0, f64::max) as f32;
+    Radius::new_scene_units(least + share * (largest - least))
 }
 
 /// Correlation coefficients; zero where a variance is not positive.
@@ -210,7 +221,8 @@ mod tests {
     fn a_concentrated_attitude_is_three_spots_in_their_shades() {
         let sphere = Sphere::icosahedral(DIVISIONS);
         let mode = Rotation3::from_euler_angles(0.3, -0.5, 1.1);
-        let colors = density_colors(&displayed(&attitude([1e7, 8e6, 5e6], mode)), &sphere);
+        let attitude = displayed(&attitude([1e7, 8e6, 5e6], mode));
+        let colors: Vec<_> = relative_densities(&attitude, &sphere).iter().map(blended).collect();
         for axis in 0..3 {
             let vertex = nearest(&sphere, &mode.matrix().column(axis).into_owned());
             let strongest = (0..3).max_by_key(|channel| colors[vertex][*channel]).unwrap();
@@ -228,16 +240,17 @@ mod tests {
         // s = (500, 0, 0) fixes the body's x axis: turn it up.
         let up = Rotation3::from_axis_angle(&Vector3::y_axis(), -std::f64::consts::FRAC_PI_2);
         let ring = MatrixFisher::new(&(up.matrix() * ring.parameter())).unwrap();
-        let colors = density_colors(&displayed(&ring), &sphere);
+        let colors: Vec<_> =
+            relative_densities(&displayed(&ring), &sphere).iter().map(blended).collect();
         let around =
             |angle: f64| colors[nearest(&sphere, &Vector3::new(angle.cos(), angle.sin(), 0.0))];
         let green = [0.0, 0.8, 1.6, 2.4, 3.2].map(|angle| around(angle)[1]);
         assert!(green.iter().all(|green| *green > 150), "{green:?}");
         assert_eq!(colors[nearest(&sphere, &Vector3::z())][0], 235);
 
-        let colors = density_colors(&displayed(&MatrixFisher::uniform()), &sphere);
-        assert!(colors.iter().all(|color| *color == colors[0]), "one color everywhere");
-        assert_ne!(colors[0], SPHERE_COLOR.map(|c| c as u8));
+        let everywhere = relative_densities(&displayed(&MatrixFisher::uniform()), &sphere);
+        assert!(everywhere.iter().flatten().all(|share| (share - 1.0).abs() < 1e-12));
+        assert_eq!(blended(&everywhere[0]), [255; 3]);
     }
 
     #[test]

@@ -24,8 +24,8 @@ use super::{belief, keypoints, map, scene};
 
 const BACKGROUND: [u8; 3] = [18, 20, 26];
 /// How far back the tracks of key points are shown, in time and in frames.
-const TRACK_NANOS: i64 = 500_000_000;
-const TRACK_FRAMES: i64 = 15;
+const TRACK_NANOS: i64 = 250_000_000;
+const TRACK_FRAMES: i64 = 8;
 
 /// Makes the layout part of the recording, as the one to open with.
 pub(super) fn send(
@@ -155,7 +155,7 @@ impl Layout {
             belief::CORRELATION,
             &["+ $origin/**".to_owned()],
         )?;
-        let range = datatypes::Range2D { x_range: [-1.0, 6.4].into(), y_range: [-1.0, 6.4].into() };
+        let range = datatypes::Range2D { x_range: [-1.2, 6.2].into(), y_range: [-1.0, 6.2].into() };
         self.property(&correlation, &VisualBounds2D::new(range))?;
         Ok(correlation)
     }

@@ -8,7 +8,7 @@ use rerun::{LineStrips2D, Points2D, RecordingStream, RecordingStreamResult};
 use super::scene::KEYPOINTS;
 use crate::odometry::{KeypointRole, KeypointView};
 
-/// Where matched points have gone since the image before; the viewer shows the last half second.
+/// Where matched points have gone since the image before; the viewer shows the last quarter of a second.
 pub(super) const TRACKS: &str = "world/estimate/body/camera/image/keypoints/tracks";
 const MATCHES: &str = "world/estimate/body/camera/image/keypoints/matches";
 

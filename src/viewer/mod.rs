@@ -14,7 +14,7 @@
 //! | `world/truth/body`, `world/truth/trajectory` | the reference |
 //! | `world/map` | map points, colored by [`MapColor`] |
 //! | `world/map/ellipsoids` | their 3 sigma ellipsoids; to be switched on in `overview` |
-//! | `belief/attitude/density` | the unit sphere of the world's directions, colored by the marginal matrix Fisher density of each body axis |
+//! | `belief/attitude/density` | points on the unit sphere of the world's directions, colored by the marginal matrix Fisher density of each body axis |
 //! | `belief/attitude/{estimate,truth}` | the body axes |
 //! | `belief/correlation` | correlation coefficients of (rotation, position) |
 //! | `plots/...` | errors, standard deviations, NEES, innovations, biases, counts, times, ... |

@@ -58,16 +58,22 @@ const AXES_WITH_BANDS: &[Series] = &[
 ];
 const ERROR_AND_BOUND: &[Series] = &[line("error", ORANGE), bound("largest 3σ", GREY)];
 
-const POSITION_ERROR: Plot =
-    Plot { entity: "plots/error/position", title: "Position error [m]", series: ERROR_AND_BOUND };
-const ATTITUDE_ERROR: Plot =
-    Plot { entity: "plots/error/attitude", title: "Attitude error [deg]", series: ERROR_AND_BOUND };
+const POSITION_ERROR: Plot = Plot {
+    entity: "plots/error/position",
+    title: "Position error [log10 m]",
+    series: ERROR_AND_BOUND,
+};
+const ATTITUDE_ERROR: Plot = Plot {
+    entity: "plots/error/attitude",
+    title: "Attitude error [log10 deg]",
+    series: ERROR_AND_BOUND,
+};
 const POSITION_SIGMA: Plot =
-    Plot { entity: "plots/sigma/position", title: "Position σ, world [m]", series: AXES };
+    Plot { entity: "plots/sigma/position", title: "Position σ, world [log10 m]", series: AXES };
 const ATTITUDE_SIGMA: Plot =
-    Plot { entity: "plots/sigma/attitude", title: "Attitude σ, body [deg]", series: AXES };
+    Plot { entity: "plots/sigma/attitude", title: "Attitude σ, body [log10 deg]", series: AXES };
 const VELOCITY_SIGMA: Plot =
-    Plot { entity: "plots/sigma/velocity", title: "Velocity σ, world [m/s]", series: AXES };
+    Plot { entity: "plots/sigma/velocity", title: "Velocity σ, world [log10 m/s]", series: AXES };
 const MATRIX_FISHER_S: Plot = Plot {
     entity: "plots/matrix_fisher/s",
     title: "Matrix Fisher S: sign(s) log10(1 + |s|)",
@@ -182,13 +188,13 @@ pub(super) fn log_report(
 
     if let Some(truth) = truth {
         let [position, attitude] = errors(report, truth);
-        log(&POSITION_ERROR, &position)?;
-        log(&ATTITUDE_ERROR, &attitude.map(f64::to_degrees))?;
+        log(&POSITION_ERROR, &position.map(decades))?;
+        log(&ATTITUDE_ERROR, &attitude.map(f64::to_degrees).map(decades))?;
         log(&NEES, &log_nees(report, truth))?;
     }
-    log(&POSITION_SIGMA, sigma(block::POSITION).as_slice())?;
-    log(&ATTITUDE_SIGMA, degrees(sigma(block::ROTATION)).as_slice())?;
-    log(&VELOCITY_SIGMA, sigma(block::VELOCITY).as_slice())?;
+    log(&POSITION_SIGMA, sigma(block::POSITION).map(decades).as_slice())?;
+    log(&ATTITUDE_SIGMA, degrees(sigma(block::ROTATION)).map(decades).as_slice())?;
+    log(&VELOCITY_SIGMA, sigma(block::VELOCITY).map(decades).as_slice())?;
     if let Some(s) = report.matrix_fisher.map(|svd| svd.s) {
         log(&MATRIX_FISHER_S, s.map(signed_log).as_slice())?;
     }
@@ -239,6 +245,12 @@ fn errors(report: &StepReport, truth: &Isometry3<f64>) -> [[f64; 2]; 2] {
     [[position, largest(block::POSITION)], [attitude, largest(block::ROTATION)]]
 }
 
+/// Errors and standard deviations fall by decades in the first frames. What is exactly zero, such
+/// as the error of the first pose, leaves a gap, as what is not finite.
+fn decades(value: f64) -> f64 {
+    if value > 0.0 { value.log10() } else { f64::NAN }
+}
+
 /// `S` spans eight decades and has a sign; this shows all of it, zero at zero.
 fn signed_log(s: f64) -> f64 {
     (1.0 + s.abs()).log10().copysign(s)
@@ -252,7 +264,7 @@ fn with_bands(value: Vector3<f64>, sigma: Vector3<f64>) -> [f64; 9] {
 
 /// Position and attitude errors squared over what is believed of them, and the two-sided 95 %
 /// band of three degrees of freedom; common logarithms, since the errors of an overconfident
-/// filter span decades. NaN leaves a gap.
+/// filter span decades.
 fn log_nees(report: &StepReport, truth: &Isometry3<f64>) -> [f64; 4] {
     let estimate = &report.state.world_from_body;
     let position = truth.translation.vector - estimate.translation.vector;
@@ -261,14 +273,11 @@ fn log_nees(report: &StepReport, truth: &Isometry3<f64>) -> [f64; 4] {
         normalised_square(error, diagonal_block(&report.covariance, block)).unwrap_or(f64::NAN)
     };
     let [lower, upper] = NEES_BAND;
-    [nees(&position, block::POSITION), nees(&attitude, block::ROTATION), upper, lower]
-        .map(|nees: f64| nees.clamp(SMALLEST_NEES, f64::INFINITY).log10())
+    [nees(&position, block::POSITION), nees(&attitude, block::ROTATION), upper, lower].map(decades)
 }
 
 /// Quantiles of the chi-square distribution of three degrees of freedom.
 const NEES_BAND: [f64; 2] = [0.215_795, 9.348_404];
-/// The first poses are put on each other, which makes their error zero.
-const SMALLEST_NEES: f64 = 1e-3;
 
 /// The order of [`TIMING`].
 fn stage_milliseconds(report: &StepReport, interval: Option<f64>) -> Vec<f64> {

@@ -1,13 +1,13 @@
-//! A unit sphere of nearly equal triangles.
+//! Points spread evenly over the unit sphere.
 
 use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 
-/// Vertices (unit vectors) and triangles, counter-clockwise seen from outside.
+/// Unit vectors, the vertices of nearly equal triangles (counter-clockwise seen from outside).
 pub(super) struct Sphere {
     pub(super) vertices: Vec<Vector3<f64>>,
-    pub(super) triangles: Vec<[u32; 3]>,
+    triangles: Vec<[u32; 3]>,
 }
 
 impl Sphere {
