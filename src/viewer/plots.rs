@@ -1,12 +1,14 @@
 //! Time series: what is plotted, under which names and colors, and in which tab it appears.
 
+use std::collections::BTreeMap;
+
 use nalgebra::{Isometry3, Vector3};
-use rerun::{RecordingStream, RecordingStreamResult, Scalars, SeriesLines};
+use rerun::{RecordingStream, RecordingStreamResult, Scalars, SeriesLines, TimeColumn};
 
 use super::covariance::{diagonal_block, principal_axes, standard_deviations};
+use super::timeline::{Clock, FRAME};
 use crate::evaluation::normalised_square;
-use crate::inertial::ImuSample;
-use crate::inertial::block;
+use crate::inertial::{ImuSample, Stamp, block};
 use crate::odometry::StepReport;
 
 /// One plot: an entity whose every row holds one number a series.
@@ -174,63 +176,108 @@ pub(super) fn log_styles(stream: &RecordingStream) -> RecordingStreamResult<()> 
     Ok(())
 }
 
-/// The numbers of one frame, at the stream's current time; `interval` is the time since the frame
-/// before, s.
-pub(super) fn log_report(
-    stream: &RecordingStream,
-    report: &StepReport,
-    truth: Option<&Isometry3<f64>>,
-    interval: Option<f64>,
-) -> RecordingStreamResult<()> {
-    let log = |plot: &Plot, values: &[f64]| log(stream, plot, values);
-    let sigma = |block| standard_deviations(&report.covariance, block);
-    let degrees = |radians: Vector3<f64>| radians.map(f64::to_degrees);
-
-    if let Some(truth) = truth {
-        let [position, attitude] = errors(report, truth);
-        log(&POSITION_ERROR, &position.map(decades))?;
-        log(&ATTITUDE_ERROR, &attitude.map(f64::to_degrees).map(decades))?;
-        log(&NEES, &log_nees(report, truth))?;
-    }
-    log(&POSITION_SIGMA, sigma(block::POSITION).map(decades).as_slice())?;
-    log(&ATTITUDE_SIGMA, degrees(sigma(block::ROTATION)).map(decades).as_slice())?;
-    log(&VELOCITY_SIGMA, sigma(block::VELOCITY).map(decades).as_slice())?;
-    if let Some(s) = report.matrix_fisher.map(|svd| svd.s) {
-        log(&MATRIX_FISHER_S, s.map(signed_log).as_slice())?;
-    }
-    if let Some(innovation) = report.innovation {
-        log(&INNOVATION, &[innovation, 1.0])?;
-    }
-    let counts = &report.counts;
-    let of_frame = [
-        counts.features,
-        counts.with_depth,
-        counts.candidates,
-        counts.matches,
-        counts.inliers,
-        counts.new_points,
-    ];
-    log(&FEATURES, &of_frame.map(|count| count as f64))?;
-    if counts.matches > 0 {
-        log(&ACCEPTED, &[100.0 * counts.inliers as f64 / counts.matches as f64])?;
-    }
-    log(&MAP_SIZE, &[counts.map_points as f64])?;
-    log(&VELOCITY, report.state.velocity.as_slice())?;
-    let gyro_bias = degrees(report.state.gyro_bias);
-    log(&GYRO_BIAS, &with_bands(gyro_bias, degrees(sigma(block::GYRO_BIAS))))?;
-    log(&ACCEL_BIAS, &with_bands(report.state.accel_bias, sigma(block::ACCEL_BIAS)))?;
-    log(&TIMING, &stage_milliseconds(report, interval))
+/// When values were measured: on the sensors' clock, and at which frame unless between two.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Moment {
+    pub(super) stamp: Stamp,
+    pub(super) frame: Option<i64>,
 }
 
-/// A sample of the IMU, at the stream's current time.
-pub(super) fn log_imu(stream: &RecordingStream, sample: &ImuSample) -> RecordingStreamResult<()> {
-    log(stream, &ANGULAR_VELOCITY, sample.angular_velocity.map(f64::to_degrees).as_slice())?;
-    log(stream, &SPECIFIC_FORCE, sample.specific_force.as_slice())
+/// Values that wait to be written together: a column of many costs little more than one value.
+#[derive(Default)]
+pub(super) struct PlotLog {
+    columns: BTreeMap<&'static str, Column>,
 }
 
-fn log(stream: &RecordingStream, plot: &Plot, values: &[f64]) -> RecordingStreamResult<()> {
-    debug_assert_eq!(plot.series.len(), values.len(), "{}", plot.entity);
-    stream.log(plot.entity, &Scalars::new(values.iter().copied()))
+#[derive(Default)]
+struct Column {
+    stamps: Vec<Stamp>,
+    /// One a stamp; empty for what falls between frames.
+    frames: Vec<i64>,
+    values: Vec<f64>,
+}
+
+impl PlotLog {
+    /// The numbers of one frame; `interval` is the time since the frame before, s.
+    pub(super) fn push_report(
+        &mut self,
+        moment: Moment,
+        report: &StepReport,
+        truth: Option<&Isometry3<f64>>,
+        interval: Option<f64>,
+    ) {
+        let mut log = |plot: &Plot, values: &[f64]| self.push(plot, moment, values);
+        let sigma = |block| standard_deviations(&report.covariance, block);
+        let degrees = |radians: Vector3<f64>| radians.map(f64::to_degrees);
+
+        if let Some(truth) = truth {
+            let [position, attitude] = errors(report, truth);
+            log(&POSITION_ERROR, &position.map(decades));
+            log(&ATTITUDE_ERROR, &attitude.map(f64::to_degrees).map(decades));
+            log(&NEES, &log_nees(report, truth));
+        }
+        log(&POSITION_SIGMA, sigma(block::POSITION).map(decades).as_slice());
+        log(&ATTITUDE_SIGMA, degrees(sigma(block::ROTATION)).map(decades).as_slice());
+        log(&VELOCITY_SIGMA, sigma(block::VELOCITY).map(decades).as_slice());
+        if let Some(s) = report.matrix_fisher.map(|svd| svd.s) {
+            log(&MATRIX_FISHER_S, s.map(signed_log).as_slice());
+        }
+        if let Some(innovation) = report.innovation {
+            log(&INNOVATION, &[innovation, 1.0]);
+        }
+        let counts = &report.counts;
+        let of_frame = [
+            counts.features,
+            counts.with_depth,
+            counts.candidates,
+            counts.matches,
+            counts.inliers,
+            counts.new_points,
+        ];
+        log(&FEATURES, &of_frame.map(|count| count as f64));
+        if counts.matches > 0 {
+            log(&ACCEPTED, &[100.0 * counts.inliers as f64 / counts.matches as f64]);
+        }
+        log(&MAP_SIZE, &[counts.map_points as f64]);
+        log(&VELOCITY, report.state.velocity.as_slice());
+        let gyro_bias = degrees(report.state.gyro_bias);
+        log(&GYRO_BIAS, &with_bands(gyro_bias, degrees(sigma(block::GYRO_BIAS))));
+        log(&ACCEL_BIAS, &with_bands(report.state.accel_bias, sigma(block::ACCEL_BIAS)));
+        log(&TIMING, &stage_milliseconds(report, interval));
+    }
+
+    /// A sample of the IMU.
+    pub(super) fn push_imu(&mut self, sample: &ImuSample) {
+        let moment = Moment { stamp: sample.stamp, frame: None };
+        let turn = sample.angular_velocity.map(f64::to_degrees);
+        self.push(&ANGULAR_VELOCITY, moment, turn.as_slice());
+        self.push(&SPECIFIC_FORCE, moment, sample.specific_force.as_slice());
+    }
+
+    fn push(&mut self, plot: &Plot, moment: Moment, values: &[f64]) {
+        debug_assert_eq!(plot.series.len(), values.len(), "{}", plot.entity);
+        let column = self.columns.entry(plot.entity).or_default();
+        column.stamps.push(moment.stamp);
+        column.frames.extend(moment.frame);
+        column.values.extend(values);
+    }
+
+    /// Writes what waits.
+    pub(super) fn flush(
+        &mut self,
+        stream: &RecordingStream,
+        clock: Clock,
+    ) -> RecordingStreamResult<()> {
+        for (entity, column) in std::mem::take(&mut self.columns) {
+            let Column { stamps, frames, values } = column;
+            let width = values.len() / stamps.len();
+            let lengths = std::iter::repeat_n(width, stamps.len());
+            let frames = (!frames.is_empty()).then(|| TimeColumn::new_sequence(FRAME, frames));
+            let times = [clock.column(&stamps)].into_iter().chain(frames);
+            stream.send_columns(entity, times, Scalars::new(values).columns(lengths)?)?;
+        }
+        Ok(())
+    }
 }
 
 /// Error and largest 3 sigma of the position (m) and of the attitude (rad).

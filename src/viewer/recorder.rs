@@ -13,6 +13,7 @@ use rerun::{RecordingStream, RecordingStreamBuilder, SpawnError, SpawnOptions};
 use super::config::is_due;
 use super::keypoints::{self, Tracks};
 use super::map::{self, MapLog};
+use super::plots::{Moment, PlotLog};
 use super::scene::{self, Scene};
 use super::sphere::Sphere;
 use super::timeline::{Clock, FRAME, TIME};
@@ -29,6 +30,11 @@ const VIEWER_TIMEOUT: Duration = Duration::from_secs(10);
 const CONNECT_PATIENCE: Duration = Duration::from_secs(3);
 /// How long a viewer may take to start and answer.
 const SPAWN_PATIENCE: Duration = Duration::from_secs(30);
+
+/// Frames whose plots are written together, into a file and to a viewer that shows them as they
+/// come.
+const FRAMES_PER_COLUMN: u64 = 150;
+const FRAMES_PER_COLUMN_LIVE: u64 = 6;
 
 /// Where a recording goes.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -92,7 +98,8 @@ impl Recorder {
         let files: Vec<PathBuf> = sinks.iter().filter_map(Sink::file).collect();
         let lossy = files.is_empty();
         let stream = open(sinks, &contents.name)?;
-        let mut writer = Writer::new(stream, contents, config)?;
+        let live = sinks.iter().any(|sink| sink.file().is_none());
+        let mut writer = Writer::new(stream, contents, config, live)?;
         let (sender, receiver) = sync_channel(config.queue_length);
         let writer = std::thread::Builder::new()
             .name("recorder".to_owned())
@@ -291,6 +298,10 @@ struct Writer {
     map: MapLog,
     tracks: Tracks,
     sphere: Sphere,
+    plots: PlotLog,
+    /// Frames whose plots are written together, and those that wait.
+    frames_per_column: u64,
+    waiting: u64,
     last_frame: Option<Stamp>,
     problem: Option<ViewerError>,
 }
@@ -301,6 +312,7 @@ impl Writer {
         stream: RecordingStream,
         contents: &Contents,
         config: &RecordingConfig,
+        live: bool,
     ) -> Result<Self, ViewerError> {
         let sphere = belief::sphere();
         blueprint::send(&stream, APPLICATION, contents, config)?;
@@ -317,6 +329,9 @@ impl Writer {
             scene: Scene::default(),
             map: MapLog::new(config.map_color, config.map_ellipsoids),
             tracks: Tracks::default(),
+            plots: PlotLog::default(),
+            frames_per_column: if live { FRAMES_PER_COLUMN_LIVE } else { FRAMES_PER_COLUMN },
+            waiting: 0,
             sphere,
             last_frame: None,
             problem: None,
@@ -342,7 +357,9 @@ impl Writer {
 
     fn log_frame(&mut self, frame: &Frame) -> Result<(), ViewerError> {
         let Frame { report, truth, imu, color, depth, belief } = frame;
-        self.log_imu(imu)?;
+        for sample in imu {
+            self.plots.push_imu(sample);
+        }
         let clock = *self.clock.get_or_insert_with(|| Clock::of(report.stamp));
         let number = i64::try_from(report.frame).unwrap_or(i64::MAX);
         self.stream.set_time(TIME, clock.cell(report.stamp));
@@ -357,7 +374,13 @@ impl Writer {
         }
         let interval = self.last_frame.replace(report.stamp);
         let interval = interval.map(|last| report.stamp.seconds_since(last));
-        plots::log_report(&self.stream, report, truth.as_ref(), interval)?;
+        let moment = Moment { stamp: report.stamp, frame: Some(number) };
+        self.plots.push_report(moment, report, truth.as_ref(), interval);
+        self.waiting += 1;
+        if self.waiting >= self.frames_per_column {
+            self.waiting = 0;
+            self.plots.flush(&self.stream, clock)?;
+        }
         scene::log_notes(&self.stream, &report.notes)?;
         if let Some(color) = color {
             let encoded = image::color(color, self.jpeg_quality, report.frame)?;
@@ -370,19 +393,13 @@ impl Writer {
         Ok(())
     }
 
-    fn log_imu(&mut self, samples: &[ImuSample]) -> Result<(), ViewerError> {
-        // Samples fall between frames.
-        self.stream.disable_timeline(FRAME);
-        for sample in samples {
-            let clock = *self.clock.get_or_insert_with(|| Clock::of(sample.stamp));
-            self.stream.set_time(TIME, clock.cell(sample.stamp));
-            plots::log_imu(&self.stream, sample)?;
-        }
-        Ok(())
-    }
-
     fn finish(mut self, files: &[PathBuf]) -> Result<(), ViewerError> {
-        let rest = self.scene.log_rest(&self.stream).map_err(ViewerError::from);
+        let clock = self.clock.unwrap_or(Clock::Start);
+        let rest = self
+            .scene
+            .log_rest(&self.stream)
+            .and_then(|()| self.plots.flush(&self.stream, clock))
+            .map_err(ViewerError::from);
         let timeout = if files.is_empty() { VIEWER_TIMEOUT } else { Duration::MAX };
         let flushed = self.stream.flush_with_timeout(timeout).map_err(ViewerError::from);
         // Dropping the last handle writes the footers.
