@@ -281,10 +281,10 @@ fn a_recording_holds_every_frame_and_is_complete() {
     assert_eq!(count("/belief/correlation/image"), 10);
     let image = "/world/estimate/body/camera/image";
     assert_eq!(count(image), 1);
-    assert_eq!(count(&format!("{image}/color")), 30);
-    assert_eq!(count(&format!("{image}/depth")), 4);
+    assert_eq!(count(&format!("{image}/color")), 20);
+    assert_eq!(count(&format!("{image}/depth")), 1);
     for name in ["inliers", "outliers", "new", "unmatched", "no_depth", "matches", "tracks"] {
-        assert_eq!(count(&format!("{image}/keypoints/{name}")), 30 + 1, "{name}");
+        assert_eq!(count(&format!("{image}/keypoints/{name}")), 20 + 1, "{name}");
     }
     assert_eq!(count("/plots/imu/gyro"), 99 + 1);
     assert_eq!(count("/log"), 2);
