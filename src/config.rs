@@ -10,7 +10,7 @@ use crate::filter::FilterConfig;
 use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
-use crate::odometry::{InitConfig, OdometryConfig, SearchConfig, TruthConfig};
+use crate::odometry::{HealthConfig, InitConfig, OdometryConfig, SearchConfig, TruthConfig};
 use crate::viewer::RecordingConfig;
 use crate::vision::{
     CameraConfig, DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig,
@@ -34,6 +34,7 @@ pub struct Config {
     pub init: InitConfig,
     pub standstill: StandstillConfig,
     pub truth: TruthConfig,
+    pub health: HealthConfig,
     pub recording: RecordingConfig,
 }
 
@@ -114,6 +115,7 @@ impl Config {
             init: self.init.clone(),
             standstill: self.standstill.clone(),
             truth: self.truth.clone(),
+            health: self.health.clone(),
         }
     }
 }

@@ -62,6 +62,10 @@ pub struct ImuConfig {
     pub gravity: f64,
     /// An interval between two samples longer than this counts as a gap, s.
     pub max_gap: f64,
+    /// White noise that stands for what the gyroscope missed in a gap, rad/s/sqrt(Hz).
+    pub gap_gyro_noise: f64,
+    /// The same for the accelerometer, m/s^2/sqrt(Hz).
+    pub gap_accel_noise: f64,
 }
 
 impl Default for ImuConfig {
@@ -77,6 +81,8 @@ impl Default for ImuConfig {
             accel_bias_sd: 1.0e-1,
             gravity: 9.80665,
             max_gap: 0.1,
+            gap_gyro_noise: 0.3,
+            gap_accel_noise: 1.0,
         }
     }
 }

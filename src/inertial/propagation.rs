@@ -29,6 +29,10 @@ pub struct Propagator {
     accel_noise: f64,
     gyro_bias_walk: f64,
     accel_bias_walk: f64,
+    /// Noises while the IMU is silent.
+    gap_gyro_noise: f64,
+    gap_accel_noise: f64,
+    in_gap: bool,
 }
 
 impl Propagator {
@@ -40,6 +44,9 @@ impl Propagator {
             accel_noise: config.accel_noise,
             gyro_bias_walk: config.gyro_bias_walk,
             accel_bias_walk: config.accel_bias_walk,
+            gap_gyro_noise: config.gap_gyro_noise,
+            gap_accel_noise: config.gap_accel_noise,
+            in_gap: false,
         }
     }
 
@@ -53,12 +60,20 @@ impl Propagator {
             accel_noise: acceleration,
             gyro_bias_walk: angular_acceleration,
             accel_bias_walk: 0.0,
+            gap_gyro_noise: 0.0,
+            gap_accel_noise: acceleration,
+            in_gap: false,
         }
     }
 
     /// Sets gravity as a vector in world coordinates, m/s^2.
     pub fn set_gravity(&mut self, gravity: Vector3<f64>) {
         self.gravity = gravity;
+    }
+
+    /// Says whether the next samples only stand in for those of a gap in the IMU's data.
+    pub fn set_imu_gap(&mut self, in_gap: bool) {
+        self.in_gap = in_gap;
     }
 
     pub fn model(&self) -> MotionModel {
@@ -190,7 +205,12 @@ impl Propagator {
     /// Covariance of the error that the white noises add over the step.
     fn noise(&self, h: f64) -> NavCovariance {
         let mut q = NavCovariance::zeros();
-        let accel = self.accel_noise.powi(2);
+        let (gyro, accel) = if self.in_gap {
+            (self.gap_gyro_noise, self.gap_accel_noise)
+        } else {
+            (self.gyro_noise, self.accel_noise)
+        };
+        let accel = accel.powi(2);
         let walk = self.gyro_bias_walk.powi(2);
         for k in 0..3 {
             let mut add = |row: usize, column: usize, value: f64| {
@@ -199,11 +219,7 @@ impl Propagator {
                     q[(column + k, row + k)] += value;
                 }
             };
-            add(
-                block::ROTATION,
-                block::ROTATION,
-                self.gyro_noise.powi(2) * h + walk * h.powi(3) / 3.0,
-            );
+            add(block::ROTATION, block::ROTATION, gyro.powi(2) * h + walk * h.powi(3) / 3.0);
             add(block::ROTATION, block::GYRO_BIAS, -walk * h * h / 2.0);
             add(block::GYRO_BIAS, block::GYRO_BIAS, walk * h);
             add(block::VELOCITY, block::VELOCITY, accel * h);
@@ -365,6 +381,26 @@ mod tests {
         for rate in [f64::NAN, f64::INFINITY, 1e308] {
             let moved = propagator().propagate(&mut belief, &sample(0, rate), &sample(9, rate));
             assert!(!moved && belief == before, "{rate}");
+        }
+    }
+
+    #[test]
+    fn a_gap_costs_certainty() {
+        let start = Belief { state: state(), covariance: NavCovariance::zeros() };
+        let sample = |nanos| ImuSample {
+            stamp: Stamp::from_nanos(nanos),
+            angular_velocity: Vector3::zeros(),
+            specific_force: Vector3::zeros(),
+        };
+        let spread = |in_gap| {
+            let (mut propagator, mut belief) = (propagator(), start);
+            propagator.set_imu_gap(in_gap);
+            assert!(propagator.propagate(&mut belief, &sample(0), &sample(500_000_000)));
+            belief.covariance
+        };
+        let (measured, missed) = (spread(false), spread(true));
+        for k in 0..9 {
+            assert!(missed[(k, k)] > 100.0 * measured[(k, k)], "{k}");
         }
     }
 

@@ -1,6 +1,7 @@
 //! The pipeline that joins front end, map and filter.
 
 mod event;
+mod health;
 mod init;
 mod pipeline;
 mod report;
@@ -16,6 +17,7 @@ use crate::map::MapConfig;
 use crate::vision::{CameraConfig, MatchingConfig, PatchConfig, RansacConfig};
 
 pub use event::{Event, TruthPose};
+pub use health::{DivergencePolicy, HealthConfig, HealthSummary};
 pub use init::{InitConfig, InitMode};
 pub use pipeline::{FrontEndFrame, Odometry, OdometryStats};
 pub use report::{
@@ -60,4 +62,5 @@ pub struct OdometryConfig {
     pub init: InitConfig,
     pub standstill: StandstillConfig,
     pub truth: TruthConfig,
+    pub health: HealthConfig,
 }

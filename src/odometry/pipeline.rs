@@ -3,6 +3,7 @@ use std::time::Instant;
 
 use nalgebra::{Isometry3, Matrix2, Matrix3, Point2, Point3, UnitQuaternion, Vector2, Vector3};
 
+use super::health::{Health, HealthSummary};
 use super::init::{Attempt, Evidence, Initializer};
 use super::report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
@@ -51,6 +52,7 @@ pub struct Odometry {
     running: Option<Running>,
     waiting_reason: Option<String>,
     map_every: u64,
+    health: Health,
     stats: OdometryStats,
 }
 
@@ -67,6 +69,7 @@ pub struct OdometryStats {
     pub initialization: Option<String>,
     /// Why it was not, when it was not.
     pub waiting_reason: Option<String>,
+    pub health: HealthSummary,
 }
 
 /// How long a frame waits for the IMU to reach it before the gap is bridged, s.
@@ -81,7 +84,13 @@ struct Running {
     time: Stamp,
     /// Whether the map had points to match before this frame.
     expects_matches: bool,
-    lost_since: Option<Stamp>,
+    /// Frames so far, those in which vision was lost left out: by them the map ages, so that it is
+    /// still there when vision comes back.
+    seeing_frames: u64,
+    /// Last sample of the IMU itself, not interpolated.
+    last_sample: Option<Stamp>,
+    /// The sample before the gap that was told of last.
+    told_gap_after: Option<Stamp>,
 }
 
 impl Odometry {
@@ -120,6 +129,7 @@ impl Odometry {
             running: None,
             waiting_reason: None,
             map_every: 0,
+            health: Health::new(&config.health),
             stats: OdometryStats::default(),
         })
     }
@@ -130,6 +140,9 @@ impl Odometry {
     }
 
     pub fn push_imu(&mut self, sample: ImuSample) {
+        if self.health.stops() {
+            return;
+        }
         self.advance(sample.stamp);
         self.imu.push_back(sample);
     }
@@ -141,6 +154,9 @@ impl Odometry {
     }
 
     pub fn push_frame(&mut self, frame: FrontEndFrame) {
+        if self.health.stops() {
+            return;
+        }
         self.advance(frame.frame.stamp.offset_by(self.config.camera.time_offset));
         self.frames.push_back((self.frames_in, frame));
         self.frames_in += 1;
@@ -152,7 +168,11 @@ impl Odometry {
     }
 
     pub fn stats(&self) -> OdometryStats {
-        OdometryStats { waiting_reason: self.waiting_reason.clone(), ..self.stats.clone() }
+        OdometryStats {
+            waiting_reason: self.waiting_reason.clone(),
+            health: self.health.summary().clone(),
+            ..self.stats.clone()
+        }
     }
 
     pub fn truth(&self) -> &TruthTrack {
@@ -163,7 +183,7 @@ impl Odometry {
     pub fn map(&self) -> Vec<MapPointView> {
         self.running
             .as_ref()
-            .map(|running| map_views(&running.map, self.frames_in))
+            .map(|running| map_views(&running.map, running.seeing_frames))
             .unwrap_or_default()
     }
 
@@ -174,6 +194,9 @@ impl Odometry {
     /// Processes the oldest waiting frame if everything up to its time is there. The frame comes
     /// back with its report.
     pub fn step(&mut self) -> Option<(StepReport, Box<RgbdFrame>)> {
+        if self.health.stops() {
+            return None;
+        }
         let mut notes = Vec::new();
         while self.running.is_none() {
             notes.extend(self.try_start()?);
@@ -246,7 +269,9 @@ impl Odometry {
             last_imu: last_imu.map(|sample| ImuSample { stamp: time, ..sample }),
             time,
             expects_matches: false,
-            lost_since: None,
+            seeing_frames: 0,
+            last_sample: last_imu.map(|sample| sample.stamp),
+            told_gap_after: None,
         });
     }
 
@@ -264,6 +289,7 @@ impl Odometry {
             body_from_camera: &self.body_from_camera,
             size: (front.frame.color.width(), front.frame.color.height()),
             seed: self.seed.wrapping_add(number),
+            lost: self.health.is_lost(),
         };
         let mut times = StageTimes { features: front.seconds, ..StageTimes::default() };
         let mut clock = StageClock::start();
@@ -282,10 +308,16 @@ impl Odometry {
         if updated.is_none() && running.expects_matches {
             self.stats.frames_without_update += 1;
         }
-        notes.extend(running.note_tracking(updated.is_some(), stamp));
+        let expected = std::mem::replace(&mut running.expects_matches, true);
+        notes.extend(self.health.see(stamp, updated.is_some(), expected));
+        let innovation = updated.map(|outcome| outcome.innovation);
+        notes.extend(self.health.judge(stamp, running.filter.belief(), innovation));
         times.update = clock.lap();
 
-        let fates = running.grow_map(number, features, &matches, &inliers, treatment, &view);
+        if !self.health.is_lost() {
+            running.seeing_frames += 1;
+        }
+        let fates = running.grow_map(features, &matches, &inliers, treatment, &view);
         times.map = clock.lap();
 
         self.stats.frames_processed += 1;
@@ -299,7 +331,7 @@ impl Odometry {
             covariance: running.filter.reported_covariance(),
             world_from_camera: belief.state.world_from_body * self.body_from_camera,
             matrix_fisher: running.filter.matrix_fisher(),
-            innovation: updated.map(|outcome| outcome.innovation),
+            innovation,
             screening: updated.map(|outcome| outcome.screening),
             counts: StepCounts {
                 features: front.features.len(),
@@ -312,7 +344,7 @@ impl Odometry {
             },
             times,
             keypoints: keypoint_views(&front.features, &fates),
-            map: wants_map.then(|| map_views(&running.map, number)),
+            map: wants_map.then(|| map_views(&running.map, running.seeing_frames)),
             notes,
         })
     }
@@ -325,6 +357,8 @@ struct View<'a> {
     body_from_camera: &'a Isometry3<f64>,
     size: (usize, usize),
     seed: u64,
+    /// Whether vision was lost before this frame.
+    lost: bool,
 }
 
 /// A feature and the map point that it looks like.
@@ -368,53 +402,52 @@ impl Running {
             self.time = stamp;
             return 0;
         };
+        last.stamp = self.time;
         let mut gaps = 0;
-        let mut advance = |filter: &mut Box<dyn VisualInertialFilter>, from: &ImuSample, to| {
-            let to: ImuSample = to;
-            let interval = to.stamp.seconds_since(from.stamp);
-            if interval > config.imu.max_gap {
-                gaps += 1;
-                let text = format!("IMU gap of {interval:.3} s before {} s", to.stamp);
-                notes.push(Note { level: NoteLevel::Warning, text });
-            }
-            if !filter.propagate(from, &to) {
+        loop {
+            let next = imu.front().copied();
+            let until = next.map_or(stamp, |sample| sample.stamp);
+            let gap = self.gap_before(until, config.imu.max_gap);
+            gaps += u64::from(self.tell_gap(gap, notes));
+            self.filter.set_imu_gap(gap.is_some());
+            let reached = next.filter(|sample| sample.stamp <= stamp);
+            let to = match (reached, next) {
+                (Some(sample), _) => sample,
+                (None, Some(next)) => interpolate(&last, &next, stamp),
+                (None, None) => ImuSample { stamp, ..last },
+            };
+            if !self.filter.propagate(&last, &to) {
                 let text = format!("IMU samples up to {} s left out: no finite belief", to.stamp);
                 notes.push(Note { level: NoteLevel::Warning, text });
             }
-        };
-        last.stamp = self.time;
-        while let Some(sample) = imu.front().copied().filter(|sample| sample.stamp <= stamp) {
+            last = to;
+            if reached.is_none() {
+                break;
+            }
             imu.pop_front();
-            advance(&mut self.filter, &last, sample);
-            last = sample;
+            self.last_sample = Some(to.stamp);
         }
-        let at_frame = match imu.front() {
-            Some(next) => interpolate(&last, next, stamp),
-            None => ImuSample { stamp, ..last },
-        };
-        advance(&mut self.filter, &last, at_frame);
-        self.last_imu = Some(at_frame);
+        self.last_imu = Some(last);
         self.time = stamp;
         gaps
     }
 
-    /// Tells when vision is lost, and when it is back.
-    fn note_tracking(&mut self, updated: bool, stamp: Stamp) -> Option<Note> {
-        let expected = std::mem::replace(&mut self.expects_matches, true);
-        match (updated, self.lost_since) {
-            (false, None) if expected => {
-                self.lost_since = Some(stamp);
-                let text = format!("vision lost at {stamp} s: too few matches agree");
-                Some(Note { level: NoteLevel::Warning, text })
-            }
-            (true, Some(since)) => {
-                self.lost_since = None;
-                let gap = stamp.seconds_since(since);
-                let text = format!("vision back at {stamp} s, after {gap:.2} s without");
-                Some(Note { level: NoteLevel::Info, text })
-            }
-            _ => None,
+    /// Length of the interval without samples up to `until`, if it is a gap, s.
+    fn gap_before(&self, until: Stamp, max_gap: f64) -> Option<f64> {
+        let interval = until.seconds_since(self.last_sample?);
+        (interval > max_gap).then_some(interval)
+    }
+
+    /// Tells of a gap when it is first met: true.
+    fn tell_gap(&mut self, gap: Option<f64>, notes: &mut Vec<Note>) -> bool {
+        let (Some(length), Some(after)) = (gap, self.last_sample) else { return false };
+        if self.told_gap_after == self.last_sample {
+            return false;
         }
+        self.told_gap_after = self.last_sample;
+        let text = format!("IMU gap of {length:.3} s after {after} s: bridged by vision");
+        notes.push(Note { level: NoteLevel::Warning, text });
+        true
     }
 
     fn world_from_camera(&self, view: &View) -> Isometry3<f64> {
@@ -425,19 +458,30 @@ impl Running {
     fn find_matches(&mut self, features: &[Feature], view: &View) -> (usize, Vec<Association>) {
         let world_from_camera = self.world_from_camera(view);
         let ids = self.map.candidates(&world_from_camera, view.camera, view.size.0, view.size.1);
-        let mut associations = self.match_candidates(&ids, features, view, false);
-        if associations.len() < view.config.search.min_matches {
-            associations = self.match_candidates(&ids, features, view, true);
+        let enough = view.config.search.min_matches;
+        let mut associations = self.match_candidates(&ids, features, view, None);
+        if associations.len() < enough {
+            let radius = Some(view.config.search.max_radius);
+            associations = self.match_candidates(&ids, features, view, radius);
+        }
+        if associations.len() < enough && view.lost {
+            // The prediction has been without correction: everything may be anywhere.
+            let ids: Vec<_> = self.map.points().iter().map(|point| point.id).collect();
+            associations = self.match_candidates(&ids, features, view, Some(f64::INFINITY));
+            return (ids.len(), associations);
         }
         (ids.len(), associations)
     }
+
+    /// Looks for map points near where they are predicted: within their uncertainty, or within
+    /// `radius` (px) where one is given.
 
     fn match_candidates(
         &self,
         ids: &[u64],
         features: &[Feature],
         view: &View,
-        everywhere: bool,
+        radius: Option<f64>,
     ) -> Vec<Association> {
         let world_from_camera = self.world_from_camera(view);
         let search = &view.config.search;
@@ -454,8 +498,8 @@ impl Running {
             let spread = by_pose * pose_covariance * by_pose.transpose() + point.covariance;
             let sigma =
                 view.camera.fx * spread.symmetric_eigenvalues().max().max(0.0).sqrt() / in_camera.z;
-            let radius = (search.min_radius + 3.0 * sigma).min(search.max_radius);
-            let radius = if everywhere { search.max_radius } else { radius };
+            let likely = (search.min_radius + 3.0 * sigma).min(search.max_radius);
+            let radius = radius.unwrap_or(likely);
             Some(Prediction { descriptor: point.descriptor, pixel, radius })
         };
         let (points, predictions): (Vec<_>, Vec<_>) = ids
@@ -536,13 +580,13 @@ impl Running {
     /// comes back in the order of `features`.
     fn grow_map(
         &mut self,
-        number: u64,
         features: &[Feature],
         matches: &[Association],
         inliers: &[usize],
         treatment: MapTreatment,
         view: &View,
     ) -> Vec<Fate> {
+        let number = self.seeing_frames;
         let world_from_camera = self.world_from_camera(view);
         let sighting = |feature: &Feature, reference| Sighting {
             frame: number,

@@ -62,6 +62,10 @@ impl VisualInertialFilter for Mekf {
         self.propagator.propagate(&mut self.belief, from, to)
     }
 
+    fn set_imu_gap(&mut self, in_gap: bool) {
+        self.propagator.set_imu_gap(in_gap);
+    }
+
     fn coast(&mut self, seconds: f64) {
         self.propagator.coast(&mut self.belief, seconds);
     }

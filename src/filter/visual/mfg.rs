@@ -156,6 +156,10 @@ impl VisualInertialFilter for MfgFilter {
         moved
     }
 
+    fn set_imu_gap(&mut self, in_gap: bool) {
+        self.propagator.set_imu_gap(in_gap);
+    }
+
     fn coast(&mut self, seconds: f64) {
         if self.broad.is_some() {
             if seconds > 0.0 {

@@ -294,6 +294,9 @@ pub trait VisualInertialFilter: Send {
     /// finite belief follows from the samples.
     fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool;
 
+    /// Says whether the next samples only stand in for those of a gap in the IMU's data.
+    fn set_imu_gap(&mut self, in_gap: bool);
+
     /// Moves the belief on by `seconds` without an IMU.
     fn coast(&mut self, seconds: f64);
 

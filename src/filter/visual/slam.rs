@@ -329,6 +329,10 @@ impl VisualInertialFilter for SlamFilter {
         step.is_some()
     }
 
+    fn set_imu_gap(&mut self, in_gap: bool) {
+        self.propagator.set_imu_gap(in_gap);
+    }
+
     fn coast(&mut self, seconds: f64) {
         self.transition = self.propagator.coast(&mut self.belief, seconds) * self.transition;
     }
