@@ -475,7 +475,6 @@ impl Running {
 
     /// Looks for map points near where they are predicted: within their uncertainty, or within
     /// `radius` (px) where one is given.
-
     fn match_candidates(
         &self,
         ids: &[u64],
