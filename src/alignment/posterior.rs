@@ -61,7 +61,7 @@ pub struct PosePosterior {
 ///     world_covariance: Matrix3::zeros(),
 /// };
 /// let posterior = align(&[Vector3::x(), Vector3::y(), Vector3::z()].map(pair))?;
-/// assert!(posterior.pose.attitude().mode().angle() < 1e-9);
+/// assert!(posterior.pose.attitude().mode().angle() < 1e-6);
 /// assert!((posterior.pose.mu() - Vector3::x()).norm() < 0.02);
 /// # Ok::<(), mfg_vio::alignment::AlignmentError>(())
 /// ```

@@ -532,7 +532,8 @@ mod tests {
         let [mfg, lm] = ["mfg", "lm"].map(|filter| mean(&report, "a=0", filter, "position_m"));
         assert!(mfg < 0.6 * lm, "{mfg} {lm}");
         let nees = mean(&report, "a=0", "mfg", "nees_position");
-        assert!((1.0..6.0).contains(&nees), "{nees}");
+        // Below 3: the rotation about the line counts as unknown, and the error does not use it up.
+        assert!((0.3..6.0).contains(&nees), "{nees}");
         let [mfg, lm] = ["mfg", "lm"].map(|filter| mean(&report, "N=3", filter, "kl_nats"));
         assert!(0.0 < mfg && mfg < lm, "{mfg} {lm}");
         let [Panel::Curves(panel)] = &report.figures[0].panels[..] else { panic!("one panel") };

@@ -77,7 +77,7 @@ impl Patch {
     pub fn cut(pixels: &[u8], width: usize, column: usize, row: usize) -> Option<Self> {
         let left = column.checked_sub(PATCH_RADIUS)?;
         let top = row.checked_sub(PATCH_RADIUS)?;
-        if left + SIDE > width {
+        if left.checked_add(SIDE)? > width {
             return None;
         }
         let mut patch = [[0; SIDE]; SIDE];

@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, SMatrix, Vector3};
 
 use super::MatrixFisher;
 use super::engine::Sums;
-use crate::so3::hat;
+use crate::so3::{hat, quaternion_from_rotation};
 
 impl MatrixFisher {
     /// Fisher information of `(U, S, V)`, the 9x9 matrix (4.21); variations are `U u^`, `s`,
@@ -60,7 +60,10 @@ impl MatrixFisher {
     pub fn divergence(&self, other: &Self) -> f64 {
         // log p' averages to tr(F'^T E[R]) - log c'.
         let cross = other.parameter().dot(&self.mean_complement());
-        let alignment = other.svd().s.sum() - other.parameter().dot(self.mode().matrix());
+        // tr(S' (I - Q)) at the mode, by the quaternion of Q: `1 - Q_ii = 2 (|x|^2 - x_i^2)`.
+        let q = quaternion_from_rotation(&other.centred(&self.mode()));
+        let x = q.fixed_rows::<3>(1).component_mul(&q.fixed_rows::<3>(1));
+        let alignment = 2.0 * other.svd().s.dot(&(Vector3::repeat(x.sum()) - x));
         let log_other = -cross - alignment - other.moments().log_c_scaled();
         -self.entropy() - log_other
     }

@@ -61,7 +61,7 @@ where
 ///     (0..3).map(move |axis| WeightedSample {
 ///         weight: 1.0,
 ///         attitude: exp(&Vector3::ith(axis, angle)),
-///         x: Vector1::new(if axis == 0 { 5.0 * angle } else { 0.1 * angle.signum() }),
+///         x: Vector1::new([5.0 * angle, 0.1, -0.1][axis]),
 ///     })
 /// });
 /// let samples: Vec<WeightedSample<Const<1>>> = turns.collect();

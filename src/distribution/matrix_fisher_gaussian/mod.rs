@@ -382,8 +382,8 @@ where
     /// let p = Matrix1x3::new(0.02, 0.02, 0.02);
     /// let belief = MatrixFisherGaussian::new(attitude, mu, sigma, p, Correlation::Body)?;
     /// let [marginal, conditional] = belief.concentration_information();
-    /// // A correlation coefficient of 0.09 is worth less than a part in a hundred.
-    /// assert!(conditional[0] < 0.01 * marginal[0]);
+    /// // A correlation coefficient of 0.09 is worth less than two parts in a hundred.
+    /// assert!(conditional[0] < 0.02 * marginal[0]);
     /// # Ok::<(), mfg_vio::distribution::matrix_fisher_gaussian::MfgError>(())
     /// ```
     pub fn concentration_information(&self) -> [Vector3<f64>; 2] {

@@ -56,6 +56,12 @@ impl FilterKind {
     pub const ALL: [Self; 6] =
         [Self::Mfgr, Self::Mfgd, Self::Mfgs, Self::Mekfr, Self::Mekfd, Self::Mekfs];
 
+    /// The filter of logs with and without an IMU: correlated map points halve the error of
+    /// difficult motion, but without an IMU the prediction is too coarse for them.
+    pub fn recommended(has_imu: bool) -> Self {
+        if has_imu { Self::Mfgs } else { Self::Mfgr }
+    }
+
     pub fn name(self) -> &'static str {
         match self {
             Self::Mfgd => "mfgd",
