@@ -280,7 +280,7 @@ mod tests {
         fn planted_shifts_are_found(
             shift in [-2.0..2.0f64, -2.0..2.0], offset in [-1.0..1.0f64, -1.0..1.0],
             turn in -0.5..0.5f64, scale in 0.8..1.25f64,
-            gain in 25.0..50.0f64, brightness in 110.0..140.0f64,
+            gain in 20.0..36.0f64, brightness in 115.0..140.0f64,
         ) {
             let (shift, offset) = (Vector2::from(shift), Vector2::from(offset));
             let reference = view(&Matrix2::identity(), -offset, 40.0, 125.0);
