@@ -96,8 +96,9 @@ fn moments_inversion_and_sampling_allocate_nothing() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let r = exp(&Vector3::new(0.1, 0.2, 0.3));
     for s in REGIMES.map(Vector3::from) {
-        // The first call fills tables that all later ones share.
+        // The first calls fill tables that all later ones share.
         let g = Moments::new(&s).unwrap().complement();
+        MatrixFisher::uniform().rotation_covariance();
         assert_eq!(allocations(|| Moments::new(&s)), 0, "{s}");
         assert_eq!(allocations(|| s_from_complement(&g)), 0, "{s}");
         assert_eq!(allocations(|| s_from_complement_near(&g, &(s * 1.001))), 0, "{s}");

@@ -111,7 +111,7 @@ impl Moments {
         4.0 * terms.iter().flatten().sum::<f64>()
     }
 
-    /// `E[(1 - Q_ii)(1 - Q_jj)(1 - Q_kk)]`, to full relative accuracy; indices from 0 to 2.
+    /// `E[(1 - Q_ii)(1 - Q_jj)(1 - Q_kk)]`, to 2e-11 in relative terms; indices from 0 to 2.
     pub fn complement_third(&self, i: usize, j: usize, k: usize) -> f64 {
         forms::complement_product(self.basis, &self.cubics, [i, j, k])
     }
