@@ -2,7 +2,6 @@
 
 #![cfg(all(feature = "vision", feature = "viewer"))]
 
-#[allow(dead_code, reason = "other test programs use the rest")]
 mod support;
 
 use std::collections::{BTreeMap, BTreeSet};

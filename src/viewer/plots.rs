@@ -292,10 +292,11 @@ fn errors(report: &StepReport, truth: &Isometry3<f64>) -> [[f64; 2]; 2] {
     [[position, largest(block::POSITION)], [attitude, largest(block::ROTATION)]]
 }
 
-/// Errors and standard deviations fall by decades in the first frames. What is exactly zero, such
-/// as the error of the first pose, leaves a gap, as what is not finite.
+/// Errors and standard deviations fall by decades in the first frames. What is zero but for
+/// rounding, such as the error of the first pose, leaves a gap, as what is not finite.
 fn decades(value: f64) -> f64 {
-    if value > 0.0 { value.log10() } else { f64::NAN }
+    const ROUNDING: f64 = 1e-9;
+    if value > ROUNDING { value.log10() } else { f64::NAN }
 }
 
 /// `S` spans eight decades and has a sign; this shows all of it, zero at zero.
