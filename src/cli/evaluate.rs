@@ -126,9 +126,10 @@ struct NeesArgs {
     directory: PathBuf,
     #[command(flatten)]
     matching: Matching,
-    /// How the reference's world is put on the estimate's
-    #[arg(long, value_enum, default_value = "origin")]
-    align: AlignArg,
+    /// How the reference's world is put on the estimate's; by default heading and position of the
+    /// first poses where both worlds are z-up, the whole first poses (origin) elsewhere
+    #[arg(long, value_enum)]
+    align: Option<AlignArg>,
     #[command(flatten)]
     output: Output,
 }
@@ -647,7 +648,7 @@ fn sub_trajectory_table(reports: &[EstimateReport]) -> Table {
 }
 
 fn nees(args: &NeesArgs) -> anyhow::Result<()> {
-    if matches!(args.align, AlignArg::Sim3) {
+    if matches!(args.align, Some(AlignArg::Sim3)) {
         wrong_usage("--align sim3: a belief has no scale".to_owned());
     }
     let reference = warn_of_order(&args.reference, evaluation::read_trajectory(&args.reference)?);
@@ -657,11 +658,14 @@ fn nees(args: &NeesArgs) -> anyhow::Result<()> {
     };
     let estimate = evaluation::read_believed_trajectory(&path)?;
     let association = args.matching.options(&path, &reference.trajectory, &estimate.trajectory)?;
-    let options = NeesOptions {
-        association,
-        alignment: args.align.into(),
-        align_n: args.matching.align_n.map(NonZeroUsize::get),
-        ..Default::default()
+    let options = match args.align {
+        Some(align) => NeesOptions {
+            association,
+            alignment: align.into(),
+            align_n: args.matching.align_n.map(NonZeroUsize::get),
+            ..Default::default()
+        },
+        None => NeesOptions::levelled(&reference.trajectory, &estimate.trajectory, association)?,
     };
     let result = evaluation::nees(&reference.trajectory, &estimate, &options)
         .with_context(|| path.display().to_string())?;
@@ -694,6 +698,7 @@ fn nees(args: &NeesArgs) -> anyhow::Result<()> {
         "estimate_poses": result.estimate_poses,
         "singular": result.singular,
         "time_offset": association.time_offset,
+        "alignment": options.alignment.name(),
         "attitude": result.attitude,
         "position": result.position,
         "joint": result.joint,

@@ -117,6 +117,30 @@ pub struct NeesOptions {
     pub confidence: f64,
 }
 
+/// Verticals of two worlds that differ by more than this are not the same, degrees.
+const SAME_VERTICAL_DEG: f64 = 5.0;
+
+impl NeesOptions {
+    /// For an estimate whose vertical is that of gravity: heading and position of the first poses
+    /// are put on each other, but not roll and pitch, whose error at the start is no property of
+    /// the world, and is corrected. Where the reference's world is not z-up (its vertical differs
+    /// from the estimate's by more than 5 degrees over the run), the whole poses are.
+    pub fn levelled(
+        reference: &Trajectory,
+        estimate: &Trajectory,
+        association: AssociationOptions,
+    ) -> Result<Self, EvaluationError> {
+        let up = matches(reference, estimate, &association)?
+            .into_iter()
+            .map(|(r, e)| (estimate.poses()[e].rotation, reference.poses()[r].rotation))
+            .fold(Vector3::zeros(), |sum, (e, r)| sum + e * (r.inverse() * Vector3::z()));
+        let same = up.angle(&Vector3::z()).to_degrees() < SAME_VERTICAL_DEG;
+        let (alignment, align_n) =
+            if same { (Alignment::Yaw, Some(1)) } else { (Alignment::Origin, None) };
+        Ok(Self { association, alignment, align_n, ..Self::default() })
+    }
+}
+
 impl Default for NeesOptions {
     /// The first poses are put on each other: an odometry's world is fixed by where it starts.
     fn default() -> Self {
@@ -400,6 +424,31 @@ mod tests {
             there.unwrap().joint.mean,
             max_relative = 1e-6
         );
+    }
+
+    /// The first pose is tilted by an error that the rest of the run does not have.
+    #[test]
+    fn an_error_of_the_first_tilt_does_not_tilt_the_world() {
+        let (truth, mut believed) = run(500, 1.0);
+        let mut poses = believed.trajectory.poses().to_vec();
+        poses[0].rotation = UnitQuaternion::new(Vector3::x() * 0.3) * truth.poses()[0].rotation;
+        poses[0].translation = truth.poses()[0].translation;
+        let stamps = truth.stamps().to_vec();
+        believed.trajectory = Trajectory::new(stamps.clone(), poses).unwrap();
+        let levelled = |truth: &Trajectory| {
+            NeesOptions::levelled(truth, &believed.trajectory, SAME_WORLD.association).unwrap()
+        };
+        let options = levelled(&truth);
+        assert_eq!((options.alignment, options.align_n), (Alignment::Yaw, Some(1)));
+        let attitude = nees(&truth, &believed, &options).unwrap().attitude.median;
+        assert!(attitude < 4.0, "{attitude}");
+        let default = nees(&truth, &believed, &NeesOptions::default()).unwrap();
+        assert!(default.attitude.median > 20.0);
+
+        let turn = UnitQuaternion::new(Vector3::y() * 1.5);
+        let poses = truth.poses().iter().map(|pose| turn * pose).collect();
+        let x_up = Trajectory::new(stamps, poses).unwrap();
+        assert_eq!(levelled(&x_up).alignment, Alignment::Origin);
     }
 
     #[test]

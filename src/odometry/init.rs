@@ -156,7 +156,7 @@ impl Initializer {
                     .unwrap_or_default()
             ));
         };
-        let Some(z_up) = self.z_up_from_truth(evidence, &pose) else {
+        let Some((z_up, tilt_sd_deg)) = self.z_up_from_truth(evidence, &pose) else {
             let reason = "`truth.up` has no direction, or is \"auto\" without an IMU";
             return Attempt::NextFrame(reason.to_owned());
         };
@@ -169,11 +169,14 @@ impl Initializer {
             Some(_) => self.filter.velocity_sd,
             None => self.filter.moving_velocity_sd,
         };
-        let tilt = self.filter.tilt_sd_deg.to_radians();
+        let body_from_world = world_from_body.rotation.inverse().to_rotation_matrix();
+        let (tilt, heading) = (tilt_sd_deg.to_radians(), self.filter.heading_sd_deg.to_radians());
+        let variances =
+            Matrix3::from_diagonal(&Vector3::new(tilt.powi(2), tilt.powi(2), heading.powi(2)));
         let attitude = InitialAttitude {
             world_from_body: world_from_body.rotation,
             gyro_bias: Vector3::zeros(),
-            covariance: Matrix3::identity() * tilt.powi(2),
+            covariance: body_from_world.matrix() * variances * body_from_world.matrix().transpose(),
         };
         let mut belief = self.belief(&attitude, velocity_sd, evidence.imu.is_some());
         belief.state.world_from_body = world_from_body;
@@ -182,18 +185,25 @@ impl Initializer {
         Attempt::Ready { belief: Box::new(belief), known: KnownAttitude::All, how }
     }
 
+    /// What turns the reference's world z-up, and the standard deviation of the tilt that is
+    /// left, degrees.
     fn z_up_from_truth(
         &self,
         evidence: &Evidence,
         world_from_body: &Isometry3<f64>,
-    ) -> Option<UnitQuaternion<f64>> {
+    ) -> Option<(UnitQuaternion<f64>, f64)> {
         match self.truth.up {
-            Up::Vector(up) => z_up_from_reference(&Vector3::from(up)),
+            Up::Vector(up) => {
+                Some((z_up_from_reference(&Vector3::from(up))?, self.filter.tilt_sd_deg))
+            }
             Up::Auto(_) => {
                 // The first attitude maps the specific force of the window well enough: the
                 // window is short and the mean acceleration in it small beside gravity.
-                let felt = StandstillCheck::measure(evidence.imu?)?.accel_mean;
-                z_up_from_reference(&(world_from_body.rotation * felt))
+                let felt = StandstillCheck::measure(evidence.imu?)?;
+                let z_up = z_up_from_reference(&(world_from_body.rotation * felt.accel_mean))?;
+                let still = felt.stands_still(&self.standstill);
+                let filter = &self.filter;
+                Some((z_up, if still { filter.tilt_sd_deg } else { filter.moving_tilt_sd_deg }))
             }
         }
     }

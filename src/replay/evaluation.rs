@@ -5,8 +5,9 @@ use nalgebra::Matrix6;
 use serde::Serialize;
 
 use crate::evaluation::{
-    Alignment, ApeOptions, ApeResult, BelievedTrajectory, Delta, EvaluationError, NeesOptions,
-    NeesResult, NeesSummary, Relation, RpeOptions, Statistics, Trajectory, ape, nees, rpe,
+    Alignment, ApeOptions, ApeResult, AssociationOptions, BelievedTrajectory, Delta,
+    EvaluationError, NeesOptions, NeesResult, NeesSummary, Relation, RpeOptions, Statistics,
+    Trajectory, ape, nees, rpe,
 };
 
 /// Time over which relative errors are taken, s.
@@ -48,9 +49,12 @@ pub struct RelativeErrors {
     pub rotation_deg: Statistics,
 }
 
-/// Normalised errors, as `evaluate nees`: the first poses are put on each other.
+/// Normalised errors, as `evaluate nees`.
 #[derive(Debug, Clone, Serialize)]
 pub struct Consistency {
+    /// How the worlds are put on each other, by the first poses: `yaw` (heading and position) or
+    /// `origin` (all).
+    pub alignment: &'static str,
     pub attitude: NeesSummary,
     pub position: NeesSummary,
     pub joint: NeesSummary,
@@ -58,11 +62,13 @@ pub struct Consistency {
     pub singular: usize,
 }
 
-/// Errors of `estimate`, whose poses have these covariances of (rotation, position).
+/// Errors of `estimate`, whose poses have these covariances of (rotation, position) and whose
+/// vertical is that of gravity if `levelled`.
 pub fn evaluate(
     reference: &Trajectory,
     estimate: &Trajectory,
     covariances: &[Matrix6<f64>],
+    levelled: bool,
 ) -> Result<Evaluated, EvaluationError> {
     let absolute = |relation| {
         let options = ApeOptions { alignment: Alignment::Se3, relation, ..Default::default() };
@@ -71,7 +77,11 @@ pub fn evaluate(
     let (translation, rotation) = (absolute(Relation::Translation)?, absolute(Relation::Angle)?);
     let believed =
         BelievedTrajectory { trajectory: estimate.clone(), covariances: covariances.to_vec() };
-    let consistency = nees(reference, &believed, &NeesOptions::default()).ok();
+    let options = match levelled {
+        true => NeesOptions::levelled(reference, estimate, AssociationOptions::default())?,
+        false => NeesOptions::default(),
+    };
+    let consistency = nees(reference, &believed, &options).ok();
     let summary = Evaluation {
         matched: translation.pairs.len(),
         reference_poses: translation.pairs.reference_poses,
@@ -80,6 +90,7 @@ pub fn evaluate(
         ape_rotation_deg: rotation.statistics,
         rpe: relative_errors(reference, estimate),
         nees: consistency.as_ref().map(|result| Consistency {
+            alignment: options.alignment.name(),
             attitude: result.attitude.clone(),
             position: result.position.clone(),
             joint: result.joint.clone(),

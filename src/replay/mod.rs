@@ -155,8 +155,8 @@ pub fn replay(
         let reason = stats.waiting_reason.unwrap_or_else(|| "the log has none".to_owned());
         return Err(ReplayError::NothingProcessed { log: request.log.clone(), reason });
     };
-    let evaluated =
-        reference.map(|reference| evaluate(&reference, &estimate, &session.covariances));
+    let evaluated = reference
+        .map(|reference| evaluate(&reference, &estimate, &session.covariances, summary.has_imu));
     let (evaluated, evaluation_failure) = match evaluated.transpose() {
         Ok(evaluated) => (evaluated, None),
         Err(error) => (None, Some(error.to_string())),
