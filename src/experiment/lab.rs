@@ -2,7 +2,11 @@
 //!
 //! The sensors, their noise and the motion are those of the simulator; what is left out is the
 //! image: corners are points that are detected with a fixed probability and never mistaken.
+//!
+//! `lab-calibration` starts from a wrong mounting of the camera and a wrong offset of its clock,
+//! once in motion and once at rest, where little of them can be seen.
 
+use std::collections::BTreeMap;
 use std::time::Instant;
 
 use nalgebra::{Isometry3, Matrix3, Point2, Point3, UnitQuaternion, Vector2, Vector3};
@@ -13,7 +17,10 @@ use rand_distr::{Distribution, StandardNormal};
 use super::study::{Observation, Report, Request, StepTime, Study, StudyError, Trial, monte_carlo};
 use crate::alignment::PointPair;
 use crate::evaluation::NeesSummary;
-use crate::filter::{FilterConfig, FilterKind, MapTreatment, SeenPoint, VisualInertialFilter};
+use crate::filter::{
+    Calibration, FilterConfig, FilterKind, MapTreatment, SeenPoint, VisualInertialFilter,
+    calibration_block,
+};
 use crate::inertial::{
     Belief, ImuConfig, ImuSample, NavCovariance, NavState, Propagator, Stamp, block,
 };
@@ -23,15 +30,24 @@ use crate::simulation::{BodyState, ImuSimulator, Motion, MotionConfig, SceneConf
 use crate::vision::{DepthReading, Descriptor, PinholeCamera, PointMeasurement};
 
 /// Studies of this module.
-pub const STUDIES: &[Study] = &[Study {
-    name: "lab-nees",
-    title: "NEES in odometry: 60 s of a hand-held camera in a lab, points without images",
-    runs: 20,
-    run: |request| study(request, &Lab::default()),
-}];
+pub const STUDIES: &[Study] = &[
+    Study {
+        name: "lab-nees",
+        title: "NEES in odometry: 60 s of a hand-held camera in a lab, points without images",
+        runs: 20,
+        run: |request| consistency(request, &Lab::default()),
+    },
+    Study {
+        name: "lab-calibration",
+        title: "calibration of the camera while running: 3 deg, 3 cm, 20 ms off, 30 s in a lab",
+        runs: 20,
+        run: |request| calibration(request, &Lab { duration: 30.0, ..Lab::default() }),
+    },
+];
 
 const FILTERS: [FilterKind; 4] =
     [FilterKind::Mfgs, FilterKind::Mekfs, FilterKind::Mfgr, FilterKind::Mekfr];
+const CALIBRATING: [FilterKind; 2] = [FilterKind::Mfgs, FilterKind::Mekfs];
 
 /// The drive.
 #[derive(Debug, Clone)]
@@ -46,6 +62,8 @@ struct Lab {
     pixel_sd: f64,
     /// Size of the image, pixels.
     image: [f64; 2],
+    /// Time at rest before the motion starts, s.
+    standstill: f64,
 }
 
 impl Default for Lab {
@@ -57,6 +75,7 @@ impl Default for Lab {
             detected: 0.7,
             pixel_sd: 0.7,
             image: [640.0, 480.0],
+            standstill: 0.0,
         }
     }
 }
@@ -69,8 +88,8 @@ pub enum LabError {
     Covariance { filter: FilterKind, seconds: f64 },
 }
 
-fn study(request: &Request, lab: &Lab) -> Result<Report, StudyError> {
-    let trials = monte_carlo(request, |rng| trial(lab, rng))?;
+fn consistency(request: &Request, lab: &Lab) -> Result<Report, StudyError> {
+    let trials = monte_carlo(request, |rng| consistency_trial(lab, rng))?;
     let mut report = Report::of("lab-nees", request.seed, &trials, &[]);
     let dof = 3 * trials.len();
     if let Some(summary) = NeesSummary::of(&[0.0], dof, 0.95) {
@@ -85,27 +104,39 @@ fn study(request: &Request, lab: &Lab) -> Result<Report, StudyError> {
     Ok(report)
 }
 
-/// What all filters of a run are given.
+fn calibration(request: &Request, lab: &Lab) -> Result<Report, StudyError> {
+    let trials = monte_carlo(request, |rng| calibration_trial(lab, rng))?;
+    let mut report = Report::of("lab-calibration", request.seed, &trials, &[]);
+    report.notes.push(
+        "Averages over the second half of each run. NEES of rotation and translation of a \
+         consistent filter is 3, that of the time offset 1. sd: as the filter believes, root mean \
+         square over the components."
+            .to_owned(),
+    );
+    Ok(report)
+}
+
+/// What all filters of a run are given. The camera's clock is that of the IMU.
 struct Drive {
-    truth: Vec<BodyState>,
+    motion: Motion,
     imu: Vec<ImuSample>,
     frames: Vec<Frame>,
     start: Belief,
     propagator: Propagator,
+    body_from_camera: Isometry3<f64>,
 }
 
 struct Frame {
-    /// Index of the IMU sample of the same instant.
-    sample: usize,
-    seen: Vec<(usize, SeenPoint)>,
-    camera: Vector3<f64>,
+    stamp: Stamp,
+    seen: Vec<(usize, PointMeasurement)>,
 }
 
 impl Drive {
     fn draw(lab: &Lab, rng: &mut ChaCha8Rng) -> Result<Self, LabError> {
         let scene = SceneConfig::default();
         let body_from_camera = scene.validate()?;
-        let motion = MotionConfig { standstill: 0.0, ramp: 1.0, ..MotionConfig::default() };
+        let standstill = lab.standstill;
+        let motion = MotionConfig { standstill, ramp: 1.0, ..MotionConfig::default() };
         let motion = Motion::built_in(&motion, &body_from_camera, rng.random());
         let landmarks: Vec<_> =
             (0..lab.landmarks).map(|_| landmark(&scene.room.size, rng)).collect();
@@ -122,23 +153,21 @@ impl Drive {
         };
         let samples_per_frame = (scene.imu.rate / lab.frame_rate).round().max(1.0) as usize;
         let samples = (lab.duration * scene.imu.rate).round() as usize;
-        let (mut truth, mut imu, mut frames) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut imu, mut frames) = (Vec::new(), Vec::new());
         for sample in 0..=samples {
             let t = sample as f64 / scene.imu.rate;
             let state = motion.state(t);
-            imu.push(imu_simulator.sample(Stamp::default().offset_by(t), &state));
-            truth.push(state);
+            let stamp = Stamp::default().offset_by(t);
+            imu.push(imu_simulator.sample(stamp, &state));
             if sample.is_multiple_of(samples_per_frame) {
                 let world_from_camera = state.world_from_body * body_from_camera;
-                let seen = sightings(lab, &scene, &landmarks, &world_from_camera, rng)
-                    .into_iter()
-                    .map(|(landmark, m)| (landmark, in_body(&m, &body_from_camera)))
-                    .collect();
-                frames.push(Frame { sample, seen, camera: world_from_camera.translation.vector });
+                let seen = sightings(lab, &scene, &landmarks, &world_from_camera, rng);
+                frames.push(Frame { stamp, seen });
             }
         }
-        let start = start(&truth[0], &config, rng);
-        Ok(Self { truth, imu, frames, start, propagator: Propagator::inertial(&config) })
+        let start = start(&motion.state(0.0), &config, rng);
+        let propagator = Propagator::inertial(&config);
+        Ok(Self { motion, imu, frames, start, propagator, body_from_camera })
     }
 }
 
@@ -239,18 +268,49 @@ fn normal(rng: &mut ChaCha8Rng) -> Vector3<f64> {
     Vector3::from_fn(|_, _| StandardNormal.sample(rng))
 }
 
-fn trial(lab: &Lab, rng: &mut ChaCha8Rng) -> Result<Trial, LabError> {
+fn consistency_trial(lab: &Lab, rng: &mut ChaCha8Rng) -> Result<Trial, LabError> {
     let drive = Drive::draw(lab, rng)?;
     let mut trial = Trial::default();
     for kind in FILTERS {
-        let run = run(kind, &drive)?;
-        let filter = kind.name();
-        for (quantity, value) in QUANTITIES.into_iter().zip(run.means) {
-            trial.observations.push(Observation { case: "lab", filter, quantity, value });
-        }
-        trial.step_times.push(StepTime { case: "lab", filter, nanoseconds: run.frame_ns });
+        run(kind, &drive, None)?.record("lab", kind, &mut trial);
     }
     Ok(trial)
+}
+
+/// Errors of the calibration that a run starts with: rotation (rad), translation (m), clock (s).
+const CALIBRATION_ERRORS: [f64; 3] = [3.0 * std::f64::consts::PI / 180.0, 0.03, 0.02];
+
+fn calibration_trial(lab: &Lab, rng: &mut ChaCha8Rng) -> Result<Trial, LabError> {
+    let at_rest = Lab { standstill: lab.duration, ..lab.clone() };
+    let mut trial = Trial::default();
+    for (case, lab) in [("motion", lab), ("rest", &at_rest)] {
+        let drive = Drive::draw(lab, rng)?;
+        let prior = wrong_calibration(&drive.body_from_camera, rng);
+        for kind in CALIBRATING {
+            run(kind, &drive, prior.as_ref())?.record(case, kind, &mut trial);
+        }
+    }
+    Ok(trial)
+}
+
+/// The true calibration but for errors of the magnitudes [`CALIBRATION_ERRORS`] in any direction,
+/// and a belief that expects as much.
+fn wrong_calibration(truth: &Isometry3<f64>, rng: &mut ChaCha8Rng) -> Option<Calibration> {
+    let [rotation, translation, offset] = CALIBRATION_ERRORS;
+    let mut direction = || normal(rng).normalize();
+    let turn = UnitQuaternion::new(direction() * rotation);
+    let body_from_camera = Isometry3::from_parts(
+        (truth.translation.vector + direction() * translation).into(),
+        turn * truth.rotation,
+    );
+    let config = FilterConfig {
+        camera_rotation_sd_deg: (rotation / 3f64.sqrt()).to_degrees(),
+        camera_translation_sd: translation / 3f64.sqrt(),
+        camera_time_offset_sd: offset,
+        ..FilterConfig::default()
+    };
+    let offset = if rng.random() { offset } else { -offset };
+    Calibration::prior(&config, &body_from_camera, offset)
 }
 
 const QUANTITIES: [&str; 6] = [
@@ -261,41 +321,135 @@ const QUANTITIES: [&str; 6] = [
     "nees_position",
     "nees_velocity",
 ];
+const CALIBRATION_QUANTITIES: [&str; 9] = [
+    "camera_rotation_deg",
+    "camera_translation_m",
+    "camera_time_offset_s",
+    "camera_rotation_sd_deg",
+    "camera_translation_sd_m",
+    "camera_time_offset_sd_s",
+    "nees_camera_rotation",
+    "nees_camera_translation",
+    "nees_camera_time_offset",
+];
 
+#[derive(Default)]
 struct Run {
-    /// Over the second half, in the order of [`QUANTITIES`].
-    means: [f64; 6],
+    /// Sums over the frames of the second half, by quantity.
+    sums: BTreeMap<&'static str, f64>,
+    frames: usize,
     /// Time of the filter and the map a frame, IMU samples included, ns.
     frame_ns: f64,
 }
 
-fn run(kind: FilterKind, drive: &Drive) -> Result<Run, LabError> {
-    let config = FilterConfig { huber: 0.0, ..FilterConfig::default() };
-    let mut filter = kind.start(&config, drive.propagator.clone(), drive.start);
-    let mut tracks = Tracks::default();
-    let (mut sums, mut count) = ([0.0; 6], 0);
-    let mut last = 0;
-    let clock = Instant::now();
-    for (number, frame) in drive.frames.iter().enumerate() {
-        for pair in drive.imu[last..=frame.sample].windows(2) {
-            filter.propagate(&pair[0], &pair[1]);
-        }
-        last = frame.sample;
-        tracks.see(filter.as_mut(), kind.map_treatment(), number as u64, frame, &config);
-        if 2 * number >= drive.frames.len() {
-            let truth = &drive.truth[frame.sample];
-            let errors = errors(filter.belief(), truth).ok_or(LabError::Covariance {
-                filter: kind,
-                seconds: drive.imu[frame.sample].stamp.seconds(),
-            })?;
-            for (sum, error) in sums.iter_mut().zip(errors) {
-                *sum += error;
-            }
-            count += 1;
+impl Run {
+    fn add<const N: usize>(&mut self, quantities: [&'static str; N], values: [f64; N]) {
+        for (quantity, value) in quantities.into_iter().zip(values) {
+            *self.sums.entry(quantity).or_default() += value;
         }
     }
-    let frame_ns = clock.elapsed().as_nanos() as f64 / drive.frames.len() as f64;
-    Ok(Run { means: sums.map(|sum| sum / f64::from(count)), frame_ns })
+
+    fn record(&self, case: &'static str, kind: FilterKind, trial: &mut Trial) {
+        let filter = kind.name();
+        for (&quantity, sum) in &self.sums {
+            let value = sum / self.frames as f64;
+            trial.observations.push(Observation { case, filter, quantity, value });
+        }
+        trial.step_times.push(StepTime { case, filter, nanoseconds: self.frame_ns });
+    }
+}
+
+fn run(
+    kind: FilterKind,
+    drive: &Drive,
+    calibration: Option<&Calibration>,
+) -> Result<Run, LabError> {
+    let config = FilterConfig { huber: 0.0, ..FilterConfig::default() };
+    let mut filter = kind.start(&config, drive.propagator.clone(), drive.start);
+    if let Some(prior) = calibration {
+        filter.calibrate(prior);
+    }
+    let mut tracks = Tracks::default();
+    let mut run = Run::default();
+    let mut imu = ImuTrack::new(&drive.imu);
+    let clock = Instant::now();
+    for (number, frame) in drive.frames.iter().enumerate() {
+        let offset = filter.calibration().map_or(0.0, |estimate| estimate.time_offset);
+        let time = frame.stamp.offset_by(offset);
+        if !imu.carry(filter.as_mut(), time) {
+            continue;
+        }
+        let (treatment, number) = (kind.map_treatment(), number as u64);
+        tracks.see(filter.as_mut(), treatment, number, frame, &drive.body_from_camera, &config);
+        if 2 * number >= drive.frames.len() as u64 {
+            let degenerate = || LabError::Covariance { filter: kind, seconds: time.seconds() };
+            let truth = drive.motion.state(time.seconds());
+            let errors = errors(filter.belief(), &truth).ok_or_else(degenerate)?;
+            run.add(QUANTITIES, errors);
+            if let Some(estimate) = filter.calibration() {
+                let errors = calibration_errors(estimate, &drive.body_from_camera);
+                run.add(CALIBRATION_QUANTITIES, errors.ok_or_else(degenerate)?);
+            }
+            run.frames += 1;
+        }
+    }
+    run.frame_ns = clock.elapsed().as_nanos() as f64 / drive.frames.len() as f64;
+    Ok(run)
+}
+
+/// Readings of the IMU, used up to some time.
+struct ImuTrack<'a> {
+    ahead: &'a [ImuSample],
+    last: Option<ImuSample>,
+}
+
+impl<'a> ImuTrack<'a> {
+    fn new(samples: &'a [ImuSample]) -> Self {
+        Self { ahead: samples, last: samples.first().copied() }
+    }
+
+    /// Moves the belief on to `time`; false if it is past that or there are no readings.
+    fn carry(&mut self, filter: &mut dyn VisualInertialFilter, time: Stamp) -> bool {
+        let Some(mut last) = self.last.filter(|last| last.stamp <= time) else { return false };
+        while let Some((next, ahead)) = self.ahead.split_first() {
+            let reached = next.stamp <= time;
+            let to = if reached { *next } else { ImuSample::between(&last, next, time) };
+            filter.propagate(&last, &to);
+            last = to;
+            if !reached {
+                break;
+            }
+            self.ahead = ahead;
+        }
+        self.last = Some(last);
+        true
+    }
+}
+
+/// In the order of [`CALIBRATION_QUANTITIES`].
+fn calibration_errors(estimate: &Calibration, truth: &Isometry3<f64>) -> Option<[f64; 9]> {
+    let found = &estimate.body_from_camera;
+    let rotation = (truth.rotation * found.rotation.inverse()).scaled_axis();
+    let translation = truth.translation.vector - found.translation.vector;
+    let offset = estimate.time_offset;
+    let block = |start: usize| estimate.covariance.fixed_view::<3, 3>(start, start).into_owned();
+    let nees = |error: &Vector3<f64>, start: usize| {
+        Some(error.dot(&block(start).cholesky()?.solve(error)))
+    };
+    let sd = |start: usize| (block(start).trace() / 3.0).sqrt();
+    let of_offset = calibration_block::TIME_OFFSET;
+    let offset_variance = estimate.covariance[(of_offset, of_offset)];
+    Some([
+        rotation.norm().to_degrees(),
+        translation.norm(),
+        offset.abs(),
+        sd(calibration_block::ROTATION).to_degrees(),
+        sd(calibration_block::TRANSLATION),
+        offset_variance.sqrt(),
+        nees(&rotation, calibration_block::ROTATION)?,
+        nees(&translation, calibration_block::TRANSLATION)?,
+        offset * offset / offset_variance,
+    ])
 }
 
 /// In the order of [`QUANTITIES`].
@@ -318,10 +472,15 @@ fn errors(belief: &Belief, truth: &BodyState) -> Option<[f64; 6]> {
     ])
 }
 
+/// Of the camera, as the filter has it, or as it is known.
+fn mounting(filter: &dyn VisualInertialFilter, known: &Isometry3<f64>) -> Isometry3<f64> {
+    filter.calibration().map_or(*known, |estimate| estimate.body_from_camera)
+}
+
 /// Which landmark is which point of the map; the map lives by the rules of the pipeline.
 struct Tracks {
     map: Map,
-    points: std::collections::BTreeMap<usize, u64>,
+    points: BTreeMap<usize, u64>,
 }
 
 impl Default for Tracks {
@@ -337,22 +496,29 @@ impl Tracks {
         treatment: MapTreatment,
         number: u64,
         frame: &Frame,
+        body_from_camera: &Isometry3<f64>,
         config: &FilterConfig,
     ) {
+        let mounted = mounting(filter, body_from_camera);
+        let camera = filter.belief().state.world_from_body * mounted;
         let sighting = Sighting {
             frame: number,
-            camera: frame.camera,
+            camera: camera.translation.vector,
             descriptor: Descriptor::from_bytes(&[0; Descriptor::BYTES]),
             reference: None,
         };
-        let (mut seen, mut fresh) = (Vec::new(), Vec::new());
-        for &(landmark, point) in &frame.seen {
-            let known = self.points.get(&landmark).filter(|id| self.map.get(**id).is_some());
+        let (mut again, mut fresh) = (Vec::new(), Vec::new());
+        for (landmark, measurement) in &frame.seen {
+            let known = self.points.get(landmark).filter(|id| self.map.get(**id).is_some());
             match known {
-                Some(&id) => seen.push(SeenPoint { id, ..point }),
-                None => fresh.push((landmark, point)),
+                Some(&id) => again.push((id, measurement)),
+                None => fresh.push((*landmark, measurement)),
             }
         }
+        let seen_from = |mounted: &Isometry3<f64>| -> Vec<_> {
+            again.iter().map(|(id, m)| SeenPoint { id: *id, ..in_body(m, mounted) }).collect()
+        };
+        let seen = seen_from(&mounted);
         let pairs: Vec<_> = seen.iter().filter_map(|point| self.pair(point)).collect();
         let updated = match filter.point_state() {
             Some(points) => points.measure(&seen).is_some(),
@@ -366,7 +532,11 @@ impl Tracks {
             }
             self.map.observe(point.id, &sighting);
         }
-        for (landmark, point) in fresh {
+        // What follows is measured by the calibration as it is now.
+        let mounted = mounting(filter, body_from_camera);
+        let mut seen = seen_from(&mounted);
+        for (landmark, measurement) in fresh {
+            let point = in_body(measurement, &mounted);
             let estimate = filter.insert(treatment, &point.in_body, &point.body_covariance);
             let id = self.map.insert(estimate.position, estimate.covariance, &sighting);
             if let Some(id) = id {
@@ -388,5 +558,28 @@ impl Tracks {
             in_world: known.position,
             world_covariance: known.covariance,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+
+    #[test]
+    fn motion_reveals_the_calibration_and_rest_does_not() {
+        let lab = Lab { duration: 10.0, frame_rate: 10.0, ..Lab::default() };
+        let trial = calibration_trial(&lab, &mut ChaCha8Rng::seed_from_u64(3)).unwrap();
+        let value = |case, quantity| {
+            let key = (case, "mfgs", quantity);
+            let found = trial.observations.iter().find(|o| (o.case, o.filter, o.quantity) == key);
+            found.unwrap().value
+        };
+        assert!(value("motion", "camera_rotation_deg") < 0.3);
+        assert!(value("motion", "camera_time_offset_s") < 2e-3);
+        // Nothing but the direction of gravity is seen of it at rest.
+        assert!(value("rest", "camera_translation_sd_m") > 0.015);
+        assert!(value("rest", "camera_time_offset_sd_s") > 0.015);
+        assert!(value("rest", "camera_translation_m") < 0.04);
     }
 }

@@ -12,7 +12,7 @@ pub use bayes::{
     PositionMeasurement, VectorEstimate, VectorMeasurement,
 };
 pub use visual::{
-    Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude, MapTreatment, Mekf, MfgFilter,
-    PointState, Screening, SeenPoint, SlamFilter, UpdateMethod, UpdateOutcome,
-    VisualInertialFilter, choose_points, point_by_pose, pose_covariance,
+    Calibration, Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude, MapTreatment,
+    Mekf, MfgFilter, PointState, Screening, SeenPoint, SlamFilter, UpdateMethod, UpdateOutcome,
+    VisualInertialFilter, calibration_block, choose_points, point_by_pose, pose_covariance,
 };

@@ -23,6 +23,19 @@ impl ImuSample {
         }
     }
 
+    /// The reading at `stamp` on the line between two samples; the later one where they are not
+    /// apart.
+    pub fn between(from: &Self, to: &Self, stamp: Stamp) -> Self {
+        let interval = to.stamp.seconds_since(from.stamp);
+        let fraction =
+            if interval > 0.0 { stamp.seconds_since(from.stamp) / interval } else { 1.0 };
+        Self {
+            stamp,
+            angular_velocity: from.angular_velocity.lerp(&to.angular_velocity, fraction),
+            specific_force: from.specific_force.lerp(&to.specific_force, fraction),
+        }
+    }
+
     pub fn is_finite(&self) -> bool {
         let finite = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
         finite(&self.angular_velocity) && finite(&self.specific_force)

@@ -12,8 +12,8 @@ use super::truth::TruthTrack;
 use super::{OdometryConfig, TruthPose, renew_state_points};
 use crate::alignment::PointPair;
 use crate::filter::{
-    FilterKind, KnownAttitude, MapTreatment, SeenPoint, UpdateOutcome, VisualInertialFilter,
-    point_by_pose,
+    Calibration, FilterKind, KnownAttitude, MapTreatment, SeenPoint, UpdateOutcome,
+    VisualInertialFilter, point_by_pose,
 };
 use crate::inertial::{Belief, ImuSample, Propagator, Stamp};
 use crate::map::{Map, MapPoint, ReferenceView, Sighting};
@@ -91,6 +91,8 @@ struct Running {
     last_sample: Option<Stamp>,
     /// The sample before the gap that was told of last.
     told_gap_after: Option<Stamp>,
+    /// The start, until the vertical is known.
+    vertical_sought_since: Option<Stamp>,
 }
 
 impl Odometry {
@@ -213,8 +215,19 @@ impl Odometry {
         Some((report, front.frame))
     }
 
+    /// When a frame was taken by the IMU's clock, as far as is known.
     fn frame_time(&self, frame: &FrontEndFrame) -> Stamp {
-        frame.frame.stamp.offset_by(self.config.camera.time_offset)
+        let estimated = self.calibration().map(|calibration| calibration.time_offset);
+        frame.frame.stamp.offset_by(estimated.unwrap_or(self.config.camera.time_offset))
+    }
+
+    /// The camera's calibration as estimated, if it is.
+    pub fn calibration(&self) -> Option<&Calibration> {
+        self.running.as_ref()?.filter.calibration()
+    }
+
+    fn body_from_camera(&self) -> Isometry3<f64> {
+        self.calibration().map_or(self.body_from_camera, |estimate| estimate.body_from_camera)
     }
 
     /// One attempt to start at the oldest frame; `None` if there is nothing to do now.
@@ -263,8 +276,16 @@ impl Odometry {
         while self.imu.front().is_some_and(|sample| sample.stamp <= time) {
             last_imu = self.imu.pop_front();
         }
+        let mut estimator = self.kind.start_knowing(known, filter, propagator, belief);
+        let offset = self.config.camera.time_offset;
+        if let Some(prior) = Calibration::prior(filter, &self.body_from_camera, offset)
+            && !(self.has_imu && estimator.calibrate(&prior))
+        {
+            tracing::warn!("only mfgs and mekfs with an IMU estimate the camera's calibration");
+        }
         self.running = Some(Running {
-            filter: self.kind.start_knowing(known, filter, propagator, belief),
+            vertical_sought_since: (!estimator.knows_vertical()).then_some(time),
+            filter: estimator,
             map: Map::new(&self.config.map),
             last_imu: last_imu.map(|sample| ImuSample { stamp: time, ..sample }),
             time,
@@ -282,11 +303,12 @@ impl Odometry {
         stamp: Stamp,
         mut notes: Vec<Note>,
     ) -> Option<StepReport> {
+        let body_from_camera = self.body_from_camera();
         let running = self.running.as_mut()?;
         let view = View {
             config: &self.config,
             camera: &self.camera,
-            body_from_camera: &self.body_from_camera,
+            body_from_camera: &body_from_camera,
             size: (front.frame.color.width(), front.frame.color.height()),
             seed: self.seed.wrapping_add(number),
             lost: self.health.is_lost(),
@@ -308,6 +330,7 @@ impl Odometry {
         if updated.is_none() && running.expects_matches {
             self.stats.frames_without_update += 1;
         }
+        notes.extend(running.tell_vertical(stamp));
         let expected = std::mem::replace(&mut running.expects_matches, true);
         notes.extend(self.health.see(stamp, updated.is_some(), expected));
         let innovation = updated.map(|outcome| outcome.innovation);
@@ -317,6 +340,9 @@ impl Odometry {
         if !self.health.is_lost() {
             running.seeing_frames += 1;
         }
+        let estimate = running.filter.calibration().map(|estimate| estimate.body_from_camera);
+        let body_from_camera = estimate.unwrap_or(body_from_camera);
+        let view = View { body_from_camera: &body_from_camera, ..view };
         let fates = running.grow_map(features, &matches, &inliers, treatment, &view);
         times.map = clock.lap();
 
@@ -329,7 +355,8 @@ impl Odometry {
             stamp: front.frame.stamp,
             state: belief.state,
             covariance: running.filter.reported_covariance(),
-            world_from_camera: belief.state.world_from_body * self.body_from_camera,
+            world_from_camera: running.world_from_camera(&view),
+            calibration: running.filter.calibration().copied(),
             matrix_fisher: running.filter.matrix_fisher(),
             innovation,
             screening: updated.map(|outcome| outcome.screening),
@@ -413,7 +440,7 @@ impl Running {
             let reached = next.filter(|sample| sample.stamp <= stamp);
             let to = match (reached, next) {
                 (Some(sample), _) => sample,
-                (None, Some(next)) => interpolate(&last, &next, stamp),
+                (None, Some(next)) => ImuSample::between(&last, &next, stamp),
                 (None, None) => ImuSample { stamp, ..last },
             };
             if !self.filter.propagate(&last, &to) {
@@ -450,8 +477,34 @@ impl Running {
         true
     }
 
+    /// Tells that the vertical is known when it has become so.
+    fn tell_vertical(&mut self, stamp: Stamp) -> Option<Note> {
+        let since = self.vertical_sought_since.take_if(|_| self.filter.knows_vertical())?;
+        let rotation = self.filter.belief().state.world_from_body.rotation.to_rotation_matrix();
+        let covariance = self.filter.pose_covariance().fixed_view::<3, 3>(0, 0).into_owned();
+        let in_world = rotation.matrix() * covariance * rotation.matrix().transpose();
+        let sd = (0.5 * (in_world.m11 + in_world.m22)).sqrt().to_degrees();
+        let seconds = stamp.seconds_since(since);
+        let text =
+            format!("attitude found after {seconds:.2} s: roll and pitch known to {sd:.1} deg");
+        Some(Note { level: NoteLevel::Info, text })
+    }
+
     fn world_from_camera(&self, view: &View) -> Isometry3<f64> {
         self.filter.belief().state.world_from_body * view.body_from_camera
+    }
+
+    fn camera_motion(&self, view: &View) -> CameraMotion {
+        let state = &self.filter.belief().state;
+        let measured = self.last_imu.map_or_else(Vector3::zeros, |sample| sample.angular_velocity);
+        let turning = measured - state.gyro_bias;
+        let moving = state.world_from_body.rotation.inverse() * state.velocity;
+        let at_camera = moving + turning.cross(&view.body_from_camera.translation.vector);
+        let camera_from_body = view.body_from_camera.rotation.inverse();
+        CameraMotion {
+            angular_velocity: camera_from_body * turning,
+            velocity: camera_from_body * at_camera,
+        }
     }
 
     /// Number of map points that should be visible, and the features that look like one.
@@ -483,6 +536,7 @@ impl Running {
         radius: Option<f64>,
     ) -> Vec<Association> {
         let world_from_camera = self.world_from_camera(view);
+        let motion = self.camera_motion(view);
         let search = &view.config.search;
         let pose_covariance = self.filter.pose_covariance();
         let rotation = self.filter.belief().state.world_from_body.rotation;
@@ -509,7 +563,7 @@ impl Running {
         let associate = |m: Match| {
             let (point, prediction) = (points.get(m.query)?, predictions.get(m.query)?);
             let feature = features.get(m.train)?;
-            let placed = place(feature, point, &world_from_camera, view)?;
+            let placed = place(feature, point, &world_from_camera, &motion, view)?;
             Some(Association {
                 feature: m.train,
                 point: point.id,
@@ -636,6 +690,23 @@ impl Running {
     }
 }
 
+/// Motion of the camera in its own coordinates, rad/s and m/s.
+struct CameraMotion {
+    angular_velocity: Vector3<f64>,
+    velocity: Vector3<f64>,
+}
+
+impl CameraMotion {
+    /// How fast a point at rest (camera coordinates, m) moves in the image, pixels/s.
+    fn image_speed(&self, point: &Vector3<f64>, camera: &PinholeCamera) -> f64 {
+        /// Short enough that the point moves by less than a pixel or so, s.
+        const STEP: f64 = 1e-3;
+        let velocity = -(self.angular_velocity.cross(point) + self.velocity);
+        let pixel = |seconds: f64| camera.project(&(point + velocity * seconds));
+        pixel(0.0).zip(pixel(STEP)).map_or(0.0, |(now, then)| (then - now).norm() / STEP)
+    }
+}
+
 /// A matched feature as a measurement of its map point.
 struct Placed {
     measurement: PointMeasurement,
@@ -650,6 +721,7 @@ fn place(
     feature: &Feature,
     point: &MapPoint,
     world_from_camera: &Isometry3<f64>,
+    motion: &CameraMotion,
     view: &View,
 ) -> Option<Placed> {
     let predicted = world_from_camera.inverse_transform_point(&Point3::from(point.position)).z;
@@ -670,7 +742,9 @@ fn place(
         && found.correlation >= config.min_correlation
     {
         shift = found.shift * feature.scale;
-        sigma = config.pixel_sigma * feature.scale;
+        let speed =
+            motion.image_speed(&view.camera.unproject(feature.pixel, depth.depth), view.camera);
+        sigma = (config.pixel_sigma * feature.scale).hypot(config.motion_sigma * speed);
         let change = warp.determinant().abs().sqrt();
         renews_reference = change.max(change.recip()) > config.max_scale_change;
     }
@@ -747,17 +821,6 @@ fn point_pair(correspondence: &Correspondence, view: &View) -> PointPair {
 /// For each of `count` items whether its index is in the ascending list `chosen`.
 fn membership(chosen: &[usize], count: usize) -> impl Iterator<Item = bool> + '_ {
     (0..count).map(|i| chosen.binary_search(&i).is_ok())
-}
-
-/// The sample at `stamp` on the line between two samples.
-fn interpolate(from: &ImuSample, to: &ImuSample, stamp: Stamp) -> ImuSample {
-    let interval = to.stamp.seconds_since(from.stamp);
-    let fraction = if interval > 0.0 { stamp.seconds_since(from.stamp) / interval } else { 1.0 };
-    ImuSample {
-        stamp,
-        angular_velocity: from.angular_velocity.lerp(&to.angular_velocity, fraction),
-        specific_force: from.specific_force.lerp(&to.specific_force, fraction),
-    }
 }
 
 fn keypoint_views(features: &[Feature], fates: &[Fate]) -> Vec<KeypointView> {

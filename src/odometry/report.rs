@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Matrix3};
 use serde::Serialize;
 
-use crate::filter::Screening;
+use crate::filter::{Calibration, Screening};
 use crate::inertial::Stamp;
 use crate::inertial::{NavCovariance, NavState};
 use crate::so3::ProperSvd;
@@ -110,6 +110,8 @@ pub struct StepReport {
     pub state: NavState,
     pub covariance: NavCovariance,
     pub world_from_camera: Isometry3<f64>,
+    /// The camera's calibration as estimated, if it is.
+    pub calibration: Option<Calibration>,
     /// Parameter of the attitude's matrix Fisher part (`None` for Gaussian filters).
     pub matrix_fisher: Option<ProperSvd>,
     /// Mean squared normalised innovation per degree of freedom; about 1 when consistent.

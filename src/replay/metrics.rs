@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::Evaluation;
 use crate::dataset::ReadReport;
+use crate::filter::Calibration;
 use crate::odometry::{OdometryStats, StageTimes};
 
 #[derive(Debug, Clone, Serialize)]
@@ -35,10 +36,40 @@ pub struct Metrics {
     pub stages: BTreeMap<&'static str, StageSummary>,
     /// Length of the estimated path, m.
     pub path_length: f64,
+    /// The camera's calibration at the end, where it was estimated.
+    pub calibration: Option<CalibrationSummary>,
     /// With a reference: how far the run is from it.
     pub evaluation: Option<Evaluation>,
     /// Why there is a reference but no evaluation.
     pub evaluation_failure: Option<String>,
+}
+
+/// Calibration between camera and IMU with standard deviations.
+#[derive(Debug, Clone, Serialize)]
+pub struct CalibrationSummary {
+    /// Rows, as `camera.imu_from_camera`.
+    pub imu_from_camera: [[f64; 4]; 4],
+    /// As `camera.time_offset`, s.
+    pub time_offset: f64,
+    /// About the axes of the IMU, degrees.
+    pub rotation_sd_deg: [f64; 3],
+    /// m.
+    pub translation_sd: [f64; 3],
+    /// s.
+    pub time_offset_sd: f64,
+}
+
+impl From<&Calibration> for CalibrationSummary {
+    fn from(calibration: &Calibration) -> Self {
+        let [a, b, c, translation_sd @ .., time_offset_sd] = calibration.standard_deviations();
+        Self {
+            imu_from_camera: calibration.body_from_camera.to_homogeneous().transpose().into(),
+            time_offset: calibration.time_offset,
+            rotation_sd_deg: [a, b, c].map(f64::to_degrees),
+            translation_sd,
+            time_offset_sd,
+        }
+    }
 }
 
 impl Metrics {
@@ -73,6 +104,11 @@ impl Metrics {
         }
         if let Some(bytes) = self.peak_memory_bytes {
             rows.push(("peak memory", format!("{:.0} MB", bytes as f64 / 1e6)));
+        }
+        if let Some(calibration) = &self.calibration {
+            let (offset, sd) = (calibration.time_offset, calibration.time_offset_sd);
+            let text = format!("time offset {:.2} ms, sd {:.2} ms", 1e3 * offset, 1e3 * sd);
+            rows.push(("calibration of the camera", text));
         }
         rows.push(("path length", format!("{:.3} m", self.path_length)));
         if let Some(evaluation) = &self.evaluation {

@@ -181,6 +181,7 @@ pub fn replay(
         peak_memory_bytes: peak_memory_bytes(),
         stages: stage_summaries(&session.series.times),
         path_length: path_length(&session.estimate),
+        calibration: odometry.calibration().map(Into::into),
         evaluation: evaluated.as_ref().map(|evaluated| evaluated.summary.clone()),
         evaluation_failure,
     };

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::{Isometry3, Vector3};
 
 use super::ReplayError;
+use crate::filter::{Calibration, calibration_block};
 use crate::inertial::{NavCovariance, NavState, Stamp, block};
 use crate::odometry::{MapPointView, StepReport};
 
@@ -98,7 +99,33 @@ pub fn state_columns() -> Vec<String> {
     columns.push("rejected".to_owned());
     let stages = crate::odometry::StageTimes::default().stages();
     columns.extend(stages.map(|(stage, _)| format!("time_{stage}")));
+    columns.extend(calibration_columns());
     columns
+}
+
+/// The camera's calibration as estimated, and its variances; empty fields where it is not.
+fn calibration_columns() -> Vec<String> {
+    let axes = |stem: &str| AXES.map(|axis| format!("{stem}_{axis}"));
+    let pose = ["px", "py", "pz", "qx", "qy", "qz", "qw"].map(|name| format!("camera_{name}"));
+    let variances = [axes("var_camera_rot"), axes("var_camera_pos")].concat();
+    let offset = ["camera_time_offset", "var_camera_time_offset"].map(str::to_owned);
+    [&pose[..], &variances, &offset].concat()
+}
+
+/// The values of [`calibration_columns`].
+fn calibration_fields(calibration: Option<&Calibration>) -> Vec<String> {
+    let values = calibration.map(|calibration| {
+        let pose = &calibration.body_from_camera;
+        let mut values: Vec<f64> = pose.translation.vector.iter().copied().collect();
+        values.extend(pose.rotation.coords.iter());
+        let (of_mounting, of_offset) =
+            (0..calibration_block::TIME_OFFSET, calibration_block::TIME_OFFSET);
+        values.extend(of_mounting.map(|k| calibration.covariance[(k, k)]));
+        values.extend([calibration.time_offset, calibration.covariance[(of_offset, of_offset)]]);
+        values
+    });
+    let field = |k: usize| optional_field(values.as_ref().and_then(|v| v.get(k).copied()));
+    (0..calibration_columns().len()).map(field).collect()
 }
 
 /// The columns of any filter's belief: stamp, state, covariances and `S`.
@@ -134,6 +161,7 @@ fn state_line(report: &StepReport) -> String {
     let rejected = report.screening.map(|screening| screening.rejected);
     fields.push(rejected.map(|count| count.to_string()).unwrap_or_default());
     fields.extend(report.times.stages().map(|(_, seconds)| format!("{seconds:.6}")));
+    fields.extend(calibration_fields(report.calibration.as_ref()));
     fields.join(",")
 }
 

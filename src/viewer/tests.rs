@@ -91,6 +91,7 @@ impl Walk {
             },
             covariance: Self::covariance(time),
             world_from_camera,
+            calibration: None,
             matrix_fisher: Some(ProperSvd {
                 u: world_from_body.rotation.to_rotation_matrix(),
                 s: Vector3::new(4e5, 3e5, 2e5) / (1.0 + time),

@@ -1,6 +1,7 @@
 //! What all visual-inertial filters share: the trait, the map treatment, the point posteriors.
 
 mod broad;
+mod calibration;
 mod gate;
 mod gravity;
 mod mekf;
@@ -20,6 +21,7 @@ use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block};
 use crate::so3::ProperSvd;
 
+pub use calibration::{Calibration, calibration_block};
 pub use mekf::Mekf;
 pub use mfg::MfgFilter;
 pub use regression::Coordinates;
@@ -225,6 +227,13 @@ pub struct FilterConfig {
     pub heading_sd_deg: f64,
     /// Standard deviation of each velocity component after a moving start, m/s.
     pub moving_velocity_sd: f64,
+    /// Standard deviation about each axis of the configured rotation between camera and IMU,
+    /// degrees. Above 0 `mfgs` and `mekfs` estimate it while running; so with the next two.
+    pub camera_rotation_sd_deg: f64,
+    /// The same of each component of the translation between them, m.
+    pub camera_translation_sd: f64,
+    /// The same of the offset between their clocks, s.
+    pub camera_time_offset_sd: f64,
     /// White angular acceleration of the constant-velocity model (no IMU), rad/s^2/sqrt(Hz).
     pub angular_acceleration: f64,
     /// White acceleration of the constant-velocity model (no IMU), m/s^2/sqrt(Hz).
@@ -250,6 +259,9 @@ impl Default for FilterConfig {
             moving_tilt_sd_deg: 5.0,
             heading_sd_deg: 0.1,
             moving_velocity_sd: 1.0,
+            camera_rotation_sd_deg: 0.0,
+            camera_translation_sd: 0.0,
+            camera_time_offset_sd: 0.0,
             angular_acceleration: 3.0,
             acceleration: 3.0,
             angular_velocity_sd: 1.0,
@@ -328,6 +340,12 @@ pub trait VisualInertialFilter: Send {
         self.belief().covariance
     }
 
+    /// Whether the world is upright: false while the filter still looks for the direction of
+    /// gravity in a world of its own.
+    fn knows_vertical(&self) -> bool {
+        true
+    }
+
     /// The turn of the world about its origin since the last call, if it was turned: whatever is
     /// kept in world coordinates outside of the filter must follow.
     fn take_world_turn(&mut self) -> Option<UnitQuaternion<f64>> {
@@ -336,6 +354,18 @@ pub trait VisualInertialFilter: Send {
 
     /// The map points of the state, if the filter keeps any there.
     fn point_state(&mut self) -> Option<&mut dyn PointState> {
+        None
+    }
+
+    /// Takes the camera's calibration into the state. From then on points are to be measured, and
+    /// frames timed, by [`Self::calibration`]. False, and no change, if the filter cannot estimate
+    /// it or already does.
+    fn calibrate(&mut self, _prior: &Calibration) -> bool {
+        false
+    }
+
+    /// The camera's calibration as estimated, if it is.
+    fn calibration(&self) -> Option<&Calibration> {
         None
     }
 }
@@ -368,6 +398,10 @@ pub trait PointState {
     /// Takes a point into the state by a measurement that the belief does not know of yet. False,
     /// and no change, if there is no room, it is held already, or it is not finite.
     fn admit(&mut self, point: &SeenPoint) -> bool;
+
+    /// Takes a point into the state that is known independently of the belief. False, and no
+    /// change, as for [`Self::admit`].
+    fn admit_known(&mut self, id: u64, estimate: &MapEstimate) -> bool;
 
     /// Marginalizes a point out: what the belief learned by it stays. False if it is not held.
     fn release(&mut self, id: u64) -> bool;

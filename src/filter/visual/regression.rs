@@ -1,6 +1,6 @@
 //! The regression of the Euclidean state on the rotation, and how points condition it.
 
-use nalgebra::{DMatrix, Matrix3, Rotation3, SMatrix, SVector, Vector3};
+use nalgebra::{DMatrix, DMatrixViewMut, Matrix3, Rotation3, SMatrix, SVector, Vector3};
 
 use crate::distribution::rotation_quadratic::{
     RotationQuadratic, rotated_vector_by_rotation, vectorize,
@@ -11,6 +11,8 @@ use crate::so3;
 const BIASES: std::ops::Range<usize> = 2..4;
 /// The position's block of the Euclidean part.
 const POSITION: usize = 1;
+/// Blocks of the calibration of the camera.
+pub(super) const CALIBRATION_BLOCKS: usize = 3;
 /// Points that are conditioned on at once. Their innovations are decorrelated by substitution,
 /// whose cost grows with the size of the batch; all that follows is matrix products.
 const BATCH: usize = 16;
@@ -36,6 +38,8 @@ pub(super) struct Measurement {
     /// Body coordinates, m^2.
     pub body_covariance: Matrix3<f64>,
     pub target: Target,
+    /// Derivative of `in_body` by the blocks of the calibration, where that is part of the state.
+    pub by_calibration: [Matrix3<f64>; CALIBRATION_BLOCKS],
 }
 
 /// What was measured.
@@ -62,6 +66,8 @@ pub(super) struct Regression<'a> {
     coordinates: Coordinates,
     prior: &'a Rotation3<f64>,
     prior_means: &'a [Vector3<f64>],
+    /// First block of the calibration of the camera, which is no vector of the world either.
+    calibration: Option<usize>,
     rotation_information: Matrix3<f64>,
     rotation_covariance: Matrix3<f64>,
     slope: DMatrix<f64>,
@@ -88,12 +94,13 @@ pub(super) struct Fit {
 
 impl<'a> Regression<'a> {
     /// Of a concentrated belief: the mode of the rotation, the means of the blocks of three of
-    /// the Euclidean part, and the covariance of both. `None` if the rotation's is not positive
-    /// definite.
+    /// the Euclidean part (from `calibration` on, where given, those of the camera's calibration),
+    /// and the covariance of both. `None` if the rotation's is not positive definite.
     pub fn of_prior(
         coordinates: Coordinates,
         prior: &'a Rotation3<f64>,
         prior_means: &'a [Vector3<f64>],
+        calibration: Option<usize>,
         covariance: &DMatrix<f64>,
     ) -> Option<Self> {
         let n = covariance.ncols() - 3;
@@ -108,6 +115,7 @@ impl<'a> Regression<'a> {
             coordinates,
             prior,
             prior_means,
+            calibration,
             rotation_information,
             rotation_covariance,
             slope: DMatrix::zeros(n, coordinates.size()),
@@ -134,7 +142,21 @@ impl<'a> Regression<'a> {
 
     /// Whether a block of `x_0` turns with the body.
     fn turns(&self, block: usize) -> bool {
-        self.coordinates == Coordinates::Group && !BIASES.contains(&block)
+        let calibrates = self
+            .calibration
+            .is_some_and(|first| (first..first + CALIBRATION_BLOCKS).contains(&block));
+        self.coordinates == Coordinates::Group && !BIASES.contains(&block) && !calibrates
+    }
+
+    /// The blocks of the calibration with the derivative of the residual by each, world
+    /// coordinates at the prior.
+    fn calibration_terms(
+        &self,
+        measurement: &Measurement,
+    ) -> impl Iterator<Item = (usize, Matrix3<f64>)> {
+        let turn = *self.prior.matrix();
+        let derivatives = measurement.by_calibration.map(|by_block| turn * by_block);
+        self.calibration.into_iter().flat_map(move |first| (first..).zip(derivatives))
     }
 
     /// Bayes' rule. Covariances are
@@ -186,13 +208,13 @@ impl<'a> Regression<'a> {
         let rows = self.design(measurement);
         let residual = (&rows * at_prior).fixed_view::<3, 1>(0, 0).into_owned();
         let by_rotation = (rows * derivative).fixed_view::<3, 3>(0, 0).into_owned();
-        let block = |a: usize, b: usize| self.covariance.fixed_view::<3, 3>(3 * a, 3 * b);
-        let mut spread = block(POSITION, POSITION)
+        let mut cross = DMatrix::zeros(self.covariance.nrows(), 3);
+        self.add_cross(measurement, &mut cross.columns_mut(0, 3));
+        let mut given_rotation = DMatrix::zeros(3, 3);
+        self.add_innovation(measurement, &cross, &mut given_rotation.columns_mut(0, 3));
+        let spread = given_rotation.fixed_view::<3, 3>(0, 0)
             + by_rotation * self.rotation_covariance * by_rotation.transpose()
             + noise;
-        if let Target::State { block: l } = measurement.target {
-            spread += block(l, l) - block(l, POSITION) - block(POSITION, l);
-        }
         let squared = residual.dot(&spread.cholesky()?.solve(&residual));
         let distance = squared.sqrt();
         let robust = huber > 0.0 && distance > huber;
@@ -210,6 +232,9 @@ impl<'a> Regression<'a> {
             }
             Target::Known { position, .. } => position,
         };
+        for (block, by_block) in self.calibration_terms(measurement) {
+            rows += by_block * self.slope.rows(3 * block, 3);
+        }
         let expected = self.prior.inverse() * (target - position);
         let last = rows.ncols() - 1;
         match self.coordinates {
@@ -234,26 +259,46 @@ impl<'a> Regression<'a> {
         rows
     }
 
+    /// Adds the covariance of `x` given the rotation with the residual of a measurement (n x 3).
+    fn add_cross(&self, measurement: &Measurement, sum: &mut DMatrixViewMut<f64>) {
+        *sum += self.covariance.columns(3 * POSITION, 3);
+        if let Target::State { block } = measurement.target {
+            *sum -= self.covariance.columns(3 * block, 3);
+        }
+        for (block, by_block) in self.calibration_terms(measurement) {
+            sum.gemm(1.0, &self.covariance.columns(3 * block, 3), &by_block.transpose(), 1.0);
+        }
+    }
+
+    /// Adds the covariance of the residual of a measurement with those whose covariance with `x`
+    /// is `cross` (3 x m).
+    fn add_innovation(
+        &self,
+        measurement: &Measurement,
+        cross: &DMatrix<f64>,
+        sum: &mut DMatrixViewMut<f64>,
+    ) {
+        *sum += cross.rows(3 * POSITION, 3);
+        if let Target::State { block } = measurement.target {
+            *sum -= cross.rows(3 * block, 3);
+        }
+        for (block, by_block) in self.calibration_terms(measurement) {
+            sum.gemm(1.0, &by_block, &cross.rows(3 * block, 3), 1.0);
+        }
+    }
+
     fn condition_batch(&mut self, batch: &[Measurement], noises: &[Matrix3<f64>]) -> Option<()> {
         let (n, m) = (self.covariance.ncols(), 3 * batch.len());
         // Covariance of x and the innovations, columns of which are contiguous.
         let mut cross = DMatrix::zeros(n, m);
         let mut design = DMatrix::zeros(m, self.coordinates.size());
         for (i, measurement) in batch.iter().enumerate() {
-            let mut columns = cross.columns_mut(3 * i, 3);
-            columns.copy_from(&self.covariance.columns(3 * POSITION, 3));
-            if let Target::State { block } = measurement.target {
-                columns -= self.covariance.columns(3 * block, 3);
-            }
+            self.add_cross(measurement, &mut cross.columns_mut(3 * i, 3));
             design.rows_mut(3 * i, 3).copy_from(&self.design(measurement));
         }
         let mut innovation = DMatrix::zeros(m, m);
         for (i, (measurement, noise)) in batch.iter().zip(noises).enumerate() {
-            let mut rows = innovation.rows_mut(3 * i, 3);
-            rows.copy_from(&cross.rows(3 * POSITION, 3));
-            if let Target::State { block } = measurement.target {
-                rows -= cross.rows(3 * block, 3);
-            }
+            self.add_innovation(measurement, &cross, &mut innovation.rows_mut(3 * i, 3));
             let mut own = innovation.fixed_view_mut::<3, 3>(3 * i, 3 * i);
             own += noise;
         }

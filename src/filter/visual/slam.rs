@@ -1,9 +1,12 @@
 //! Filters that keep map points in the state, with all correlations (`mfgs`, `mekfs`).
 
-use nalgebra::{DMatrix, Matrix3, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, Dyn, Matrix3, OMatrix, Point3, U3, UnitQuaternion, Vector3};
 
+use super::calibration::{BodyMotion, Calibration};
 use super::gravity::UnknownGravity;
-use super::regression::{Coordinates, Fit, Measurement, Posterior, Regression, Target};
+use super::regression::{
+    CALIBRATION_BLOCKS, Coordinates, Fit, Measurement, Posterior, Regression, Target,
+};
 use super::{
     FilterConfig, PointState, Screening, SeenPoint, UpdateOutcome, VisualInertialFilter,
     point_by_pose,
@@ -21,9 +24,14 @@ struct StatePoint {
     id: u64,
     /// World coordinates, m.
     position: Vector3<f64>,
+    /// Where it was when it entered. The calibration's derivatives are taken there for ever: taken
+    /// where the point is seen, they would differ by its noise from frame to frame, and what does
+    /// not differ between frames would seem to be measured.
+    entered_at: Vector3<f64>,
 }
 
-/// Visual-inertial filter whose Euclidean state is `(v, p, b_g, b_a, l_1 ... l_M)`.
+/// Visual-inertial filter whose Euclidean state is `(v, p, b_g, b_a, l_1 ... l_M)`, after `b_a` the
+/// [`Calibration`] where it is estimated.
 ///
 /// A point `l` of the state measured at `p'` in the body frame is `0 = R p' + p - l + noise`.
 /// Between updates the belief is the mode and the covariance of the error around it, as in
@@ -48,6 +56,11 @@ pub struct SlamFilter {
     /// Gravity as part of the state, its block following the navigation part, until its direction
     /// is known well enough for the world to be turned upright.
     gravity: Option<UnknownGravity>,
+    /// The camera's calibration as part of the state, following gravity, if it is uncertain. Its
+    /// covariance is that of the last update.
+    calibration: Option<Calibration>,
+    /// Angular velocity as last measured, rad/s.
+    measured_rate: Vector3<f64>,
     /// Whether the heading is that of an arbitrary world: uniform, and independent of all else.
     heading_is_free: bool,
     /// For each point of the last update that it entered: the robust kernel weighs them all.
@@ -73,6 +86,8 @@ impl SlamFilter {
             covariance,
             transition: NavCovariance::identity(),
             gravity: None,
+            calibration: None,
+            measured_rate: Vector3::zeros(),
             heading_is_free: false,
             passed: Vec::new(),
             world_turn: None,
@@ -99,9 +114,37 @@ impl SlamFilter {
         self.with_free_heading()
     }
 
+    /// First row of what follows gravity.
+    fn after_gravity(&self) -> usize {
+        NAVIGATION + if self.gravity.is_some() { 3 } else { 0 }
+    }
+
+    /// Rows of the calibration.
+    fn calibration_rows(&self) -> std::ops::Range<usize> {
+        let start = self.after_gravity();
+        start..start + if self.calibration.is_some() { 3 * CALIBRATION_BLOCKS } else { 0 }
+    }
+
     /// First row of the points.
     fn base(&self) -> usize {
-        NAVIGATION + if self.gravity.is_some() { 3 } else { 0 }
+        self.calibration_rows().end
+    }
+
+    /// Derivative of a point of the world as measured in the body by the blocks of the
+    /// calibration.
+    fn by_calibration(&self, point: &Vector3<f64>) -> Option<[Matrix3<f64>; CALIBRATION_BLOCKS]> {
+        let state = &self.belief.state;
+        let in_body = state.world_from_body.inverse_transform_point(&Point3::from(*point)).coords;
+        let motion = BodyMotion {
+            angular_velocity: self.measured_rate - state.gyro_bias,
+            velocity: state.world_from_body.rotation.inverse() * state.velocity,
+        };
+        let sd = |start: usize| {
+            let covariance = self.belief.covariance.fixed_view::<3, 3>(start, start);
+            covariance.trace().max(0.0).sqrt()
+        };
+        let motion = motion.beyond_noise(sd(block::GYRO_BIAS), sd(block::VELOCITY));
+        Some(self.calibration.as_ref()?.derivatives(&in_body, &motion))
     }
 
     fn synchronize(&mut self) {
@@ -132,6 +175,7 @@ impl SlamFilter {
         blocks[block::GYRO_BIAS / 3 - 1] = state.gyro_bias;
         blocks[block::ACCEL_BIAS / 3 - 1] = state.accel_bias;
         blocks.extend(self.gravity.as_ref().map(|gravity| gravity.mean));
+        blocks.extend(self.calibration.iter().flat_map(Calibration::blocks));
         blocks.extend(self.points.iter().map(|point| point.position));
         blocks
     }
@@ -143,11 +187,17 @@ impl SlamFilter {
         self.synchronize();
         let prior = self.belief.state.world_from_body.rotation.to_rotation_matrix();
         let means = self.euclidean();
+        let calibration = self.calibration.map(|_| self.after_gravity() / 3 - 1);
         let mut weighted_at = prior;
         let mut posterior: Option<(Posterior, Fit)> = None;
         for _ in 0..=self.config.relinearizations {
-            let mut regression =
-                Regression::of_prior(self.coordinates, &prior, &means, &self.covariance)?;
+            let mut regression = Regression::of_prior(
+                self.coordinates,
+                &prior,
+                &means,
+                calibration,
+                &self.covariance,
+            )?;
             let fit = regression.condition(measurements, &weighted_at, self.config.huber)?;
             let found = regression.posterior()?;
             let turned = so3::log(&weighted_at.rotation_to(&found.mode)).norm();
@@ -159,11 +209,22 @@ impl SlamFilter {
             }
         }
         let (posterior, fit) = posterior?;
+        let turn = so3::log(&(prior.inverse() * posterior.mode));
+        let explained = 3.0 * measurements.len() as f64 * fit.innovation;
+        if self.turn_distance(&turn)? > MOST_TURN * explained.max(NOISE_TURN) {
+            return None;
+        }
         self.accept(posterior)?;
         self.settle_gravity();
         let screening = Screening { largest: fit.largest, threshold: f64::INFINITY, rejected: 0 };
         self.passed = vec![true; measurements.len()];
         Some(UpdateOutcome { innovation: fit.innovation, points: measurements.len(), screening })
+    }
+
+    /// Squared Mahalanobis distance of a turn of the body from the belief.
+    fn turn_distance(&self, turn: &Vector3<f64>) -> Option<f64> {
+        let covariance = self.covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION);
+        Some(turn.dot(&covariance.cholesky()?.solve(turn)))
     }
 
     fn accept(&mut self, posterior: Posterior) -> Option<()> {
@@ -191,8 +252,40 @@ impl SlamFilter {
             gravity.follow(&covariance);
             self.propagator.set_gravity(*mean);
         }
+        let rows = self.calibration_rows();
+        if let (Some(calibration), Some([turn, translation, offset])) =
+            (&mut self.calibration, means.get(rows.start / 3 - 1..rows.end / 3 - 1))
+        {
+            *calibration = calibration.moved([*turn, *translation, *offset]);
+            calibration.covariance =
+                covariance.fixed_view::<7, 7>(rows.start, rows.start).into_owned();
+        }
         self.covariance = covariance;
         Some(())
+    }
+
+    /// Adds a point whose covariance with the state is `rows`. False, and no change, if it is not
+    /// finite.
+    fn append(
+        &mut self,
+        id: u64,
+        position: Vector3<f64>,
+        rows: &OMatrix<f64, U3, Dyn>,
+        own: &Matrix3<f64>,
+    ) -> bool {
+        let finite = position.iter().chain(rows.iter()).chain(own.iter()).all(|x| x.is_finite());
+        if !finite {
+            return false;
+        }
+        let n = self.covariance.ncols();
+        let mut covariance = DMatrix::zeros(n + 3, n + 3);
+        covariance.view_mut((0, 0), (n, n)).copy_from(&self.covariance);
+        covariance.view_mut((n, 0), (3, n)).copy_from(rows);
+        covariance.view_mut((0, n), (n, 3)).copy_from(&rows.transpose());
+        covariance.view_mut((n, n), (3, 3)).copy_from(&((own + own.transpose()) * 0.5));
+        self.covariance = covariance;
+        self.points.push(StatePoint { id, position, entered_at: position });
+        true
     }
 
     /// Row of a point's block in the covariance.
@@ -218,9 +311,11 @@ impl SlamFilter {
     /// Turns everything in world coordinates; the covariance is up to date.
     fn turn_world(&mut self, turn: &UnitQuaternion<f64>) {
         let matrix = turn.to_rotation_matrix().into_inner();
+        let calibration = self.calibration_rows();
         let world_blocks = [block::VELOCITY, block::POSITION]
             .into_iter()
-            .chain((NAVIGATION..self.covariance.ncols()).step_by(3));
+            .chain((NAVIGATION..self.covariance.ncols()).step_by(3))
+            .filter(|row| !calibration.contains(row));
         for row in world_blocks {
             let rows = matrix * self.covariance.rows(row, 3);
             self.covariance.rows_mut(row, 3).copy_from(&rows);
@@ -232,6 +327,7 @@ impl SlamFilter {
         state.velocity = turn * state.velocity;
         for point in &mut self.points {
             point.position = turn * point.position;
+            point.entered_at = turn * point.entered_at;
         }
         if let Some(gravity) = &mut self.gravity {
             gravity.mean = turn * gravity.mean;
@@ -261,8 +357,16 @@ impl SlamFilter {
         state.velocity += part(block::VELOCITY);
         state.gyro_bias += part(block::GYRO_BIAS);
         state.accel_bias += part(block::ACCEL_BIAS);
+        let base = self.base();
         for (slot, point) in self.points.iter_mut().enumerate() {
-            point.position += part(NAVIGATION + 3 + 3 * slot);
+            point.position += part(base + 3 * slot);
+        }
+        let row = self.calibration_rows().start;
+        if let Some(calibration) = &mut self.calibration {
+            let blocks = calibration.blocks();
+            let moved = std::array::from_fn(|k| blocks[k] + part(row + 3 * k));
+            *calibration = calibration.moved(moved);
+            calibration.covariance = self.covariance.fixed_view::<7, 7>(row, row).into_owned();
         }
     }
 
@@ -282,8 +386,9 @@ impl SlamFilter {
         set(block::ROTATION, gravity.rotation_by_gravity(&state.world_from_body.rotation));
         set(block::VELOCITY, gravity.vector_by_gravity(&state.velocity));
         set(block::POSITION, gravity.vector_by_gravity(position));
+        let base = self.base();
         for (slot, point) in self.points.iter().enumerate() {
-            set(NAVIGATION + 3 * slot, gravity.vector_by_gravity(&point.position));
+            set(base + 3 * slot, gravity.vector_by_gravity(&point.position));
         }
         self.covariance = &by_old * &self.covariance * by_old.transpose();
         self.belief.covariance =
@@ -312,6 +417,13 @@ impl SlamFilter {
 /// An attitude that moved further than this in an update has its measurements weighted anew at
 /// where it came to, rad.
 const RELINEARIZE_ABOVE: f64 = 0.02;
+/// In a linear system an update turns the body by a squared Mahalanobis distance of at most that
+/// of the innovations. Beyond so many times that, the concentrated form has found the density's
+/// mode where it does not hold, and wrong matches have led it there.
+const MOST_TURN: f64 = 4.0;
+/// Innovations smaller than this are taken for as much: the 99.9 % quantile of chi-square with
+/// three degrees of freedom.
+const NOISE_TURN: f64 = 16.3;
 
 impl VisualInertialFilter for SlamFilter {
     fn belief(&self) -> &Belief {
@@ -321,6 +433,7 @@ impl VisualInertialFilter for SlamFilter {
     fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool {
         let step = self.propagator.propagate_with_transition(&mut self.belief, from, to);
         if let Some(step) = step {
+            self.measured_rate = to.angular_velocity;
             self.transition = step * self.transition;
             if let Some(gravity) = &mut self.gravity {
                 gravity.propagate(&mut self.belief, &step, to.stamp.seconds_since(from.stamp));
@@ -340,13 +453,14 @@ impl VisualInertialFilter for SlamFilter {
     fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome> {
         let measurements: Vec<_> = pairs
             .iter()
-            .map(|pair| Measurement {
-                in_body: pair.in_body,
-                body_covariance: pair.body_covariance,
-                target: Target::Known {
-                    position: pair.in_world,
-                    covariance: pair.world_covariance,
-                },
+            .map(|pair| {
+                let (position, covariance) = (pair.in_world, pair.world_covariance);
+                Measurement {
+                    in_body: pair.in_body,
+                    body_covariance: pair.body_covariance,
+                    target: Target::Known { position, covariance },
+                    by_calibration: self.by_calibration(&position).unwrap_or_default(),
+                }
             })
             .collect();
         self.condition(&measurements)
@@ -374,12 +488,36 @@ impl VisualInertialFilter for SlamFilter {
         }
     }
 
+    fn knows_vertical(&self) -> bool {
+        self.gravity.is_none()
+    }
+
     fn take_world_turn(&mut self) -> Option<UnitQuaternion<f64>> {
         self.world_turn.take()
     }
 
     fn point_state(&mut self) -> Option<&mut dyn PointState> {
         Some(self)
+    }
+
+    fn calibrate(&mut self, prior: &Calibration) -> bool {
+        if self.calibration.is_some() {
+            return false;
+        }
+        self.synchronize();
+        let row = self.after_gravity();
+        let covariance = std::mem::take(&mut self.covariance);
+        let mut covariance = covariance
+            .insert_rows(row, 3 * CALIBRATION_BLOCKS, 0.0)
+            .insert_columns(row, 3 * CALIBRATION_BLOCKS, 0.0);
+        covariance.fixed_view_mut::<7, 7>(row, row).copy_from(&prior.covariance);
+        self.covariance = covariance;
+        self.calibration = Some(*prior);
+        true
+    }
+
+    fn calibration(&self) -> Option<&Calibration> {
+        self.calibration.as_ref()
     }
 }
 
@@ -403,18 +541,21 @@ impl PointState for SlamFilter {
 
     fn measure(&mut self, seen: &[SeenPoint]) -> Option<UpdateOutcome> {
         let measurement = |point: &SeenPoint| {
+            let slot = self.slot(point.id)?;
+            let entered_at = &self.points.get(slot)?.entered_at;
             Some(Measurement {
                 in_body: point.in_body,
                 body_covariance: point.body_covariance,
-                target: Target::State { block: self.base() / 3 - 1 + self.slot(point.id)? },
+                target: Target::State { block: self.base() / 3 - 1 + slot },
+                by_calibration: self.by_calibration(entered_at).unwrap_or_default(),
             })
         };
         let measurements: Vec<_> = seen.iter().filter_map(measurement).collect();
         self.condition(&measurements)
     }
 
-    /// The point's error is exactly that of the pose, moved to the point, and that of the
-    /// measurement.
+    /// The point's error is exactly that of the pose, moved to the point, that of the calibration
+    /// and that of the measurement.
     fn admit(&mut self, point: &SeenPoint) -> bool {
         if self.free_slots() == 0 || self.slot(point.id).is_some() {
             return false;
@@ -425,26 +566,32 @@ impl PointState for SlamFilter {
         let j = point_by_pose(rotation.matrix(), &point.in_body);
         let (by_rotation, by_position) = (j.fixed_columns::<3>(0), j.fixed_columns::<3>(3));
         let n = self.covariance.ncols();
-        let rows = by_rotation * self.covariance.fixed_rows::<3>(block::ROTATION)
-            + by_position * self.covariance.fixed_rows::<3>(block::POSITION);
-        let measured = rotation.matrix() * point.body_covariance * rotation.matrix().transpose();
-        let own: Matrix3<f64> = rows.fixed_view::<3, 3>(0, block::ROTATION)
-            * by_rotation.transpose()
-            + rows.fixed_view::<3, 3>(0, block::POSITION) * by_position.transpose()
-            + measured;
         let position = rotation * point.in_body + pose.translation.vector;
-        let finite = position.iter().chain(rows.iter()).chain(own.iter()).all(|x| x.is_finite());
-        if !finite {
+        let calibration = self.by_calibration(&position).into_iter().flatten();
+        let terms: Vec<(usize, Matrix3<f64>)> = [
+            (block::ROTATION, by_rotation.into_owned()),
+            (block::POSITION, by_position.into_owned()),
+        ]
+        .into_iter()
+        .chain((self.after_gravity()..).step_by(3).zip(calibration.map(|by| rotation * by)))
+        .collect();
+        let mut rows = OMatrix::<f64, U3, Dyn>::zeros(n);
+        for (row, by_block) in &terms {
+            rows += by_block * self.covariance.fixed_rows::<3>(*row);
+        }
+        let mut own = rotation.matrix() * point.body_covariance * rotation.matrix().transpose();
+        for (row, by_block) in &terms {
+            own += rows.fixed_view::<3, 3>(0, *row) * by_block.transpose();
+        }
+        self.append(point.id, position, &rows, &own)
+    }
+
+    fn admit_known(&mut self, id: u64, estimate: &MapEstimate) -> bool {
+        if self.free_slots() == 0 || self.slot(id).is_some() {
             return false;
         }
-        let mut covariance = DMatrix::zeros(n + 3, n + 3);
-        covariance.view_mut((0, 0), (n, n)).copy_from(&self.covariance);
-        covariance.view_mut((n, 0), (3, n)).copy_from(&rows);
-        covariance.view_mut((0, n), (n, 3)).copy_from(&rows.transpose());
-        covariance.view_mut((n, n), (3, 3)).copy_from(&((own + own.transpose()) * 0.5));
-        self.covariance = covariance;
-        self.points.push(StatePoint { id: point.id, position });
-        true
+        let independent = OMatrix::<f64, U3, Dyn>::zeros(self.covariance.ncols());
+        self.append(id, estimate.position, &independent, &estimate.covariance)
     }
 
     fn release(&mut self, id: u64) -> bool {
@@ -500,6 +647,18 @@ mod tests {
         kind.start(&config, Propagator::inertial(&ImuConfig::default()), belief)
     }
 
+    /// A calibration that is uncertain in all its parts.
+    fn uncertain_calibration() -> Calibration {
+        let config = FilterConfig {
+            camera_rotation_sd_deg: 1.0,
+            camera_translation_sd: 0.02,
+            camera_time_offset_sd: 0.01,
+            ..FilterConfig::default()
+        };
+        let mounting = Isometry3::new(Vector3::new(0.1, 0.0, -0.05), Vector3::new(0.3, -1.2, 0.4));
+        Calibration::prior(&config, &mounting, 0.0).unwrap()
+    }
+
     fn seen(id: u64, in_body: Vector3<f64>, body_covariance: Matrix3<f64>) -> SeenPoint {
         SeenPoint { id, in_body, body_covariance }
     }
@@ -542,11 +701,14 @@ mod tests {
         /// and the position keep their covariance, whatever the spread and the noise.
         #[test]
         fn measuring_again_without_motion_tells_nothing_of_the_pose(
-            seed: u64, spread in 0.01..0.3f64, anisotropy in 1.0..10.0f64,
+            seed: u64, spread in 0.01..0.3f64, anisotropy in 1.0..10.0f64, calibrates: bool,
         ) {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let prior = belief(&mut rng, spread);
             let mut mfgs = filter(FilterKind::Mfgs, prior);
+            if calibrates {
+                assert!(mfgs.calibrate(&uncertain_calibration()));
+            }
             let deviations = Vector3::new(0.02, 0.02, 0.02 * anisotropy);
             measure_without_moving(mfgs.as_mut(), &deviations, &mut rng);
             let (before, after) = (prior.covariance, mfgs.belief().covariance);
@@ -704,6 +866,25 @@ mod tests {
         let seen_spread = j * super::super::pose_covariance(&belief.covariance) * j.transpose();
         let spread = mfgs.point_state().unwrap().estimate(0).unwrap().covariance;
         assert!((seen_spread - spread).norm() < 1e-3 * spread.norm());
+    }
+
+    /// Seen from one place, a wrong mounting moves all points alike and cannot be told from their
+    /// places: neither its mean nor its covariance moves.
+    #[test]
+    fn a_camera_that_does_not_move_tells_nothing_of_its_mounting() {
+        let mut rng = ChaCha8Rng::seed_from_u64(23);
+        let prior = belief(&mut rng, 0.01);
+        let calibration = uncertain_calibration();
+        let mut mfgs = filter(FilterKind::Mfgs, prior);
+        assert!(mfgs.calibrate(&calibration) && !mfgs.calibrate(&calibration));
+        measure_without_moving(mfgs.as_mut(), &Vector3::repeat(0.02), &mut rng);
+        let after = mfgs.calibration().unwrap();
+        let change = (after.covariance - calibration.covariance).norm();
+        assert!(change < 1e-9 * calibration.covariance.norm(), "{change}");
+        let (before, after) = (calibration.body_from_camera, after.body_from_camera);
+        assert!(before.rotation.angle_to(&after.rotation) < 1e-9);
+        assert!((before.translation.vector - after.translation.vector).norm() < 1e-9);
+        assert!(!filter(FilterKind::Mfgr, prior).calibrate(&calibration));
     }
 
     #[test]
