@@ -31,6 +31,13 @@ pub struct Calibration {
     pub covariance: SMatrix<f64, 7, 7>,
 }
 
+/// Random walk of each component of the rotation, rad/sqrt(s).
+const DRIFT_OF_ROTATION: f64 = 3e-4;
+/// The same of the translation, m/sqrt(s).
+const DRIFT_OF_TRANSLATION: f64 = 3e-4;
+/// The same of the time offset, s/sqrt(s).
+const DRIFT_OF_OFFSET: f64 = 5e-5;
+
 impl Calibration {
     /// The configured calibration, as uncertain as `config` says; `None` where all of it is known.
     pub fn prior(
@@ -56,6 +63,20 @@ impl Calibration {
     /// Standard deviations in the order of [`calibration_block`].
     pub fn standard_deviations(&self) -> [f64; 7] {
         std::array::from_fn(|k| self.covariance[(k, k)].max(0.0).sqrt())
+    }
+
+    /// Variances that a drift over `seconds` adds to the uncertain parts. Mountings and clocks hold
+    /// better than this; what it lets be forgotten is the error of the first linearisations, made
+    /// at a calibration far from the true one.
+    pub(super) fn drift(&self, seconds: f64) -> [f64; 7] {
+        std::array::from_fn(|k| {
+            let density = match k {
+                calibration_block::TIME_OFFSET => DRIFT_OF_OFFSET,
+                calibration_block::TRANSLATION.. => DRIFT_OF_TRANSLATION,
+                _ => DRIFT_OF_ROTATION,
+            };
+            if self.covariance[(k, k)] > 0.0 { density * density * seconds } else { 0.0 }
+        })
     }
 
     /// Means of its blocks of the state: an error of the rotation, the translation, and the time

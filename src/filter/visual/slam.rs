@@ -24,10 +24,11 @@ struct StatePoint {
     id: u64,
     /// World coordinates, m.
     position: Vector3<f64>,
-    /// Where it was when it entered. The calibration's derivatives are taken there for ever: taken
-    /// where the point is seen, they would differ by its noise from frame to frame, and what does
-    /// not differ between frames would seem to be measured.
-    entered_at: Vector3<f64>,
+    /// Where it was when it entered, carried along by the corrections of the body's pose. The
+    /// calibration's derivatives are taken there for ever: taken where the point is seen or has
+    /// been estimated since, they would differ from frame to frame by noise, and what does not
+    /// differ between frames would seem to be measured.
+    entered_at: Point3<f64>,
 }
 
 /// Visual-inertial filter whose Euclidean state is `(v, p, b_g, b_a, l_1 ... l_M)`, after `b_a` the
@@ -130,11 +131,22 @@ impl SlamFilter {
         self.calibration_rows().end
     }
 
+    /// Lets the calibration drift over an interval, s.
+    fn drift(&mut self, seconds: f64) {
+        if let Some(calibration) = &self.calibration {
+            let variances = calibration.drift(seconds.max(0.0));
+            let row = self.calibration_rows().start;
+            for (k, variance) in variances.into_iter().enumerate() {
+                self.covariance[(row + k, row + k)] += variance;
+            }
+        }
+    }
+
     /// Derivative of a point of the world as measured in the body by the blocks of the
     /// calibration.
-    fn by_calibration(&self, point: &Vector3<f64>) -> Option<[Matrix3<f64>; CALIBRATION_BLOCKS]> {
+    fn by_calibration(&self, point: &Point3<f64>) -> Option<[Matrix3<f64>; CALIBRATION_BLOCKS]> {
         let state = &self.belief.state;
-        let in_body = state.world_from_body.inverse_transform_point(&Point3::from(*point)).coords;
+        let in_body = state.world_from_body.inverse_transform_point(point).coords;
         let motion = BodyMotion {
             angular_velocity: self.measured_rate - state.gyro_bias,
             velocity: state.world_from_body.rotation.inverse() * state.velocity,
@@ -242,10 +254,12 @@ impl SlamFilter {
         if !(finite && belief.is_finite()) {
             return None;
         }
+        let correction = belief.state.world_from_body * self.belief.state.world_from_body.inverse();
         self.belief = belief;
         let points = means.iter().skip(self.base() / 3 - 1);
         for (point, position) in self.points.iter_mut().zip(points) {
             point.position = *position;
+            point.entered_at = correction * point.entered_at;
         }
         if let (Some(gravity), Some(mean)) = (&mut self.gravity, means.get(NAVIGATION / 3 - 1)) {
             gravity.mean = *mean;
@@ -284,7 +298,7 @@ impl SlamFilter {
         covariance.view_mut((0, n), (n, 3)).copy_from(&rows.transpose());
         covariance.view_mut((n, n), (3, 3)).copy_from(&((own + own.transpose()) * 0.5));
         self.covariance = covariance;
-        self.points.push(StatePoint { id, position, entered_at: position });
+        self.points.push(StatePoint { id, position, entered_at: position.into() });
         true
     }
 
@@ -434,6 +448,7 @@ impl VisualInertialFilter for SlamFilter {
         let step = self.propagator.propagate_with_transition(&mut self.belief, from, to);
         if let Some(step) = step {
             self.measured_rate = to.angular_velocity;
+            self.drift(to.stamp.seconds_since(from.stamp));
             self.transition = step * self.transition;
             if let Some(gravity) = &mut self.gravity {
                 gravity.propagate(&mut self.belief, &step, to.stamp.seconds_since(from.stamp));
@@ -459,7 +474,7 @@ impl VisualInertialFilter for SlamFilter {
                     in_body: pair.in_body,
                     body_covariance: pair.body_covariance,
                     target: Target::Known { position, covariance },
-                    by_calibration: self.by_calibration(&position).unwrap_or_default(),
+                    by_calibration: self.by_calibration(&position.into()).unwrap_or_default(),
                 }
             })
             .collect();
@@ -567,7 +582,7 @@ impl PointState for SlamFilter {
         let (by_rotation, by_position) = (j.fixed_columns::<3>(0), j.fixed_columns::<3>(3));
         let n = self.covariance.ncols();
         let position = rotation * point.in_body + pose.translation.vector;
-        let calibration = self.by_calibration(&position).into_iter().flatten();
+        let calibration = self.by_calibration(&position.into()).into_iter().flatten();
         let terms: Vec<(usize, Matrix3<f64>)> = [
             (block::ROTATION, by_rotation.into_owned()),
             (block::POSITION, by_position.into_owned()),
