@@ -117,6 +117,8 @@ pub struct NeesOptions {
     pub confidence: f64,
 }
 
+/// Standard deviation of each component of the attitude below which it is known, rad.
+const KNOWN_ATTITUDE: f64 = 0.2;
 /// Verticals of two worlds that differ by more than this are not the same, degrees.
 const SAME_VERTICAL_DEG: f64 = 5.0;
 
@@ -194,7 +196,9 @@ pub struct NeesResult {
 
 /// Judges the covariances of an estimate by its errors.
 ///
-/// The reference is moved to the estimate's world, so that the covariances stay as they are.
+/// The reference is moved to the estimate's world, so that the covariances stay as they are. The
+/// alignment begins where the attitude is known: before, an estimate that seeks the vertical has
+/// no world yet.
 pub fn nees(
     reference: &Trajectory,
     estimate: &BelievedTrajectory,
@@ -218,21 +222,26 @@ pub fn nees(
             indices.len(),
         ));
     }
+    let covariance = |e: usize| estimate.covariances.get(e).copied().unwrap_or_else(Matrix6::zeros);
+    let knows_attitude = |e: usize| {
+        let rotation = covariance(e).fixed_view::<3, 3>(0, 0).into_owned();
+        rotation.trace() < 3.0 * KNOWN_ATTITUDE.powi(2)
+    };
+    let first = indices.iter().position(|&(_, e)| knows_attitude(e)).unwrap_or(0);
     // Roles swapped: the reference is what gets aligned.
     let swapped = PosePairs {
-        stamps: indices.iter().map(|&(_, e)| trajectory.stamps()[e]).collect(),
-        reference: indices.iter().map(|&(_, e)| trajectory.poses()[e]).collect(),
-        estimate: indices.iter().map(|&(r, _)| reference.poses()[r]).collect(),
+        stamps: indices[first..].iter().map(|&(_, e)| trajectory.stamps()[e]).collect(),
+        reference: indices[first..].iter().map(|&(_, e)| trajectory.poses()[e]).collect(),
+        estimate: indices[first..].iter().map(|&(r, _)| reference.poses()[r]).collect(),
         reference_poses: trajectory.len(),
         estimate_poses: reference.len(),
         shared: 0,
     };
     let alignment = align(&swapped, options.alignment, options.align_n)?;
     let mut series = Series::default();
-    for (k, &(r, e)) in indices.iter().enumerate() {
-        let covariance = estimate.covariances.get(e).copied().unwrap_or_else(Matrix6::zeros);
+    for &(r, e) in &indices {
         let truth = alignment.apply(&reference.poses()[r]);
-        series.push(swapped.stamps[k], &truth, &trajectory.poses()[e], &covariance);
+        series.push(trajectory.stamps()[e], &truth, &trajectory.poses()[e], &covariance(e));
     }
     let summary = |values: &[f64], dof| {
         NeesSummary::of(values, dof, confidence).ok_or(EvaluationError::NoCovariance)
