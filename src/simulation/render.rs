@@ -87,7 +87,7 @@ pub struct Shot {
 const NEAR: f32 = 0.05;
 /// Rows of a band (one task) and columns of a tile (one list of candidates).
 const BAND: usize = 16;
-const TILE: usize = 32;
+const TILE: usize = 16;
 
 /// What one ray met.
 #[derive(Debug, Clone, Copy, Default)]
@@ -107,6 +107,10 @@ struct Scene<'a> {
     views: Vec<View>,
     /// Smallest rectangle of pixels that contains each box: left, top, right, bottom.
     bounds: Vec<[f32; 4]>,
+    /// No point of a box is at less depth than this, m.
+    nearest: Vec<f32>,
+    /// Boxes by [`Self::nearest`], the room last.
+    order: Vec<usize>,
     camera: Lens,
 }
 
@@ -129,6 +133,9 @@ impl Scene<'_> {
         let (x, y) = self.camera.direction(column, row);
         let mut nearest: Option<(usize, super::world::Hit)> = None;
         for &index in candidates {
+            if nearest.is_some_and(|(_, hit)| hit.distance < self.nearest[index]) {
+                continue;
+            }
             let hit = self.world.solids[index].hit_in_view(&self.views[index], x, y, NEAR);
             if let Some(hit) = hit.filter(|h| nearest.is_none_or(|(_, n)| h.distance < n.distance))
             {
@@ -147,10 +154,12 @@ impl Scene<'_> {
 
     /// Boxes that may be seen between two corners of the image.
     fn candidates(&self, left: f32, top: f32, right: f32, bottom: f32, list: &mut Vec<usize>) {
+        let is_inside = |index: &usize| {
+            let b = &self.bounds[*index];
+            b[0] <= right && b[2] >= left && b[1] <= bottom && b[3] >= top
+        };
         list.clear();
-        list.extend(self.bounds.iter().enumerate().filter_map(|(index, b)| {
-            (b[0] <= right && b[2] >= left && b[1] <= bottom && b[3] >= top).then_some(index)
-        }));
+        list.extend(self.order.iter().copied().filter(is_inside));
     }
 }
 
@@ -259,11 +268,23 @@ impl Renderer {
         let views = self.world.solids.iter().map(|solid| solid.view(&pose)).collect();
         let bounds =
             self.world.solids.iter().map(|solid| self.bounds(solid, &camera_from_world)).collect();
+        let nearest: Vec<f32> = self
+            .world
+            .solids
+            .iter()
+            .map(|solid| nearest_depth(solid, &camera_from_world))
+            .collect();
+        let key = |index: &usize| (self.world.solids[*index].inside_out, nearest[*index]);
+        let mut order: Vec<usize> = (0..nearest.len()).collect();
+        order.sort_by(|a, b| {
+            let ((room_a, depth_a), (room_b, depth_b)) = (key(a), key(b));
+            room_a.cmp(&room_b).then(depth_a.total_cmp(&depth_b))
+        });
         let camera = Lens {
             center: [self.camera.cx as f32, self.camera.cy as f32],
             pixel: [1.0 / self.camera.fx as f32, 1.0 / self.camera.fy as f32],
         };
-        Scene { world: &self.world, views, bounds, camera }
+        Scene { world: &self.world, views, bounds, nearest, order, camera }
     }
 
     fn bounds(&self, solid: &Solid, camera_from_world: &Isometry3<f32>) -> [f32; 4] {
@@ -347,6 +368,16 @@ fn quantiles() -> Vec<f32> {
         .collect();
     let sd = (raw.iter().map(|x| x * x).sum::<f64>() / 4096.0).sqrt();
     raw.into_iter().map(|x| (x / sd) as f32).collect()
+}
+
+/// Depth of the nearest corner of a box, less what rounding may make of it.
+fn nearest_depth(solid: &Solid, camera_from_world: &Isometry3<f32>) -> f32 {
+    const ROUNDING: f32 = 1e-3;
+    if solid.inside_out {
+        return f32::MIN;
+    }
+    let depth = |corner| (camera_from_world * nalgebra::Point3::from(corner)).z;
+    solid.corners().map(depth).into_iter().fold(f32::MAX, f32::min) - ROUNDING
 }
 
 fn trace_band(scene: &Scene, first_row: usize, width: usize, samples: &mut [Sample]) {

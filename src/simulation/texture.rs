@@ -19,8 +19,6 @@ pub struct Texture {
     levels: Vec<Level>,
     /// Edge of a texel of the finest level, m.
     texel: f32,
-    /// Whether coordinates wrap around instead of stopping at the border.
-    wraps: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -53,13 +51,14 @@ impl Level {
     /// 1/256 of a texel. Integers, two channels to a word: this is where rendering spends its
     /// time.
     #[inline]
-    fn bilinear(&self, x: f32, y: f32, wraps: bool) -> [f32; 3] {
+    fn bilinear(&self, x: f32, y: f32) -> [f32; 3] {
         const PAIR: u32 = 0x00ff_00ff;
         let (x, y) = ((x * 256.0) as i32, (y * 256.0) as i32);
         let (fx, fy) = ((x & 255) as u32, (y & 255) as u32);
         let (column, row) = (x >> 8, y >> 8);
-        let (x0, x1) = (index(column, self.width, wraps), index(column + 1, self.width, wraps));
-        let (y0, y1) = (index(row, self.height, wraps), index(row + 1, self.height, wraps));
+        let index = |i: i32, len: usize| i.clamp(0, len as i32 - 1) as usize;
+        let (x0, x1) = (index(column, self.width), index(column + 1, self.width));
+        let (y0, y1) = (index(row, self.height), index(row + 1, self.height));
         let line = |y: usize| {
             let texel = |x: usize| u32::from_le_bytes(self.texels[y * self.width + x]);
             let (a, b) = (texel(x0), texel(x1));
@@ -72,9 +71,14 @@ impl Level {
     }
 }
 
+/// The finer of the two levels next to a footprint of `ratio` texels, and the weight of the coarser.
 #[inline]
-fn index(i: i32, len: usize, wraps: bool) -> usize {
-    if wraps { i.rem_euclid(len as i32) as usize } else { i.clamp(0, len as i32 - 1) as usize }
+fn mip(ratio: f32) -> (usize, f32) {
+    // Exponent and mantissa of the ratio are a good enough logarithm.
+    let bits = ratio.max(1.0).to_bits();
+    // Blending only halfway between levels saves half of the second look-ups unseen.
+    let blend = (2.0 * (bits & 0x7f_ffff) as f32 / 8_388_608.0 - 0.5).clamp(0.0, 1.0);
+    ((bits >> 23) as usize - 127, blend)
 }
 
 impl Texture {
@@ -104,16 +108,12 @@ impl Texture {
 
     /// Value for a square footprint of `width` m, between the two nearest levels.
     #[inline]
-    pub fn trilinear(&self, u: f32, v: f32, width: f32) -> Color {
-        // Exponent and mantissa of the ratio are a good enough logarithm.
-        let bits = (width / self.texel).max(1.0).to_bits();
-        let fine = (bits >> 23) as usize - 127;
-        // Blending only halfway between levels saves half of the second look-ups unseen.
-        let blend = (2.0 * (bits & 0x7f_ffff) as f32 / 8_388_608.0 - 0.5).clamp(0.0, 1.0);
+    fn trilinear(&self, u: f32, v: f32, width: f32) -> Color {
+        let (fine, blend) = mip(width / self.texel);
         let coarsest = self.levels.len() - 1;
         let at = |level: usize| {
             let scale = 1.0 / (self.texel * (1_u32 << level) as f32);
-            self.levels[level].bilinear(u * scale - 0.5, v * scale - 0.5, self.wraps)
+            self.levels[level].bilinear(u * scale - 0.5, v * scale - 0.5)
         };
         if fine >= coarsest || blend == 0.0 {
             return at(fine.min(coarsest));
@@ -124,15 +124,28 @@ impl Texture {
         let (a, b) = (at(fine), at(fine + 1));
         std::array::from_fn(|k| a[k] + (b[k] - a[k]) * blend)
     }
+}
 
-    /// Footprints above this see nothing of [`Self::fine_grain`], m.
-    pub const FINE_GRAIN_LIMIT: f32 = 0.01;
+/// A grey pattern of 2 cm shapes and below that wraps around; laid over the larger textures it
+/// gives close views something to see.
+#[derive(Debug, Clone)]
+pub struct Grain {
+    /// Squares of [`Self::SIDE`] texels, half of it, ...
+    levels: Vec<Vec<u8>>,
+}
 
-    /// A grey pattern of 2 cm shapes and below, `512 x 512` texels of 0.6 mm, that wraps around;
-    /// laid over the larger textures it gives close views something to see. Its mean is 128.
-    pub fn fine_grain(rng: &mut ChaCha8Rng) -> Self {
-        let texel = 0.0006;
-        let mut canvas = Canvas::new(512, 512, texel, [128.0; 3]);
+impl Grain {
+    /// Footprints above this see nothing of it, m.
+    pub const LIMIT: f32 = 0.01;
+
+    /// A power of two, so that wrapping around is a mask: a remainder would cost more than the rest
+    /// of a look-up.
+    const SIDE: usize = 512;
+    /// Edge of a texel of the finest level, m.
+    const TEXEL: f32 = 0.0006;
+
+    pub fn new(rng: &mut ChaCha8Rng) -> Self {
+        let mut canvas = Canvas::new(Self::SIDE, Self::SIDE, Self::TEXEL, [128.0; 3]);
         let side = canvas.width();
         for _ in 0..6000 {
             let radius = power_law_radius(rng, 0.0008, 0.02);
@@ -146,12 +159,59 @@ impl Texture {
                 }
             }
         }
-        let mean =
-            canvas.texels.iter().map(|t| f32::from(t[0])).sum::<f32>() / canvas.texels.len() as f32;
-        for texel in &mut canvas.texels {
-            *texel = texel.map(|t| (f32::from(t) - mean + 128.0).clamp(0.0, 255.0) as u8);
+        let greys: Vec<f32> = canvas.texels.iter().map(|texel| f32::from(texel[0])).collect();
+        let mean = greys.iter().sum::<f32>() / greys.len() as f32;
+        let mut level: Vec<u8> =
+            greys.iter().map(|grey| (grey - mean + 128.0).clamp(0.0, 255.0) as u8).collect();
+        let mut levels = Vec::new();
+        while level.len() > 1 {
+            let next = Self::halved(&level);
+            levels.push(std::mem::replace(&mut level, next));
         }
-        canvas.finish(true)
+        levels.push(level);
+        Self { levels }
+    }
+
+    fn halved(level: &[u8]) -> Vec<u8> {
+        let side = level.len().isqrt();
+        let at = |x: usize, y: usize| u16::from(level[y * side + x]);
+        let mean = |x: usize, y: usize| {
+            ((at(x, y) + at(x + 1, y) + at(x, y + 1) + at(x + 1, y + 1) + 2) / 4) as u8
+        };
+        let corners = (0..side).step_by(2);
+        corners.clone().flat_map(|y| corners.clone().map(move |x| mean(x, y))).collect()
+    }
+
+    /// Factor on the brightness, 1 in the mean, for a square footprint of `width` m around
+    /// coordinates in m.
+    #[inline]
+    pub fn factor(&self, u: f32, v: f32, width: f32) -> f32 {
+        let (fine, blend) = mip(width / Self::TEXEL);
+        let coarsest = self.levels.len() - 1;
+        let grey = if fine >= coarsest || blend == 0.0 {
+            self.bilinear(fine.min(coarsest), u, v)
+        } else if blend == 1.0 {
+            self.bilinear(fine + 1, u, v)
+        } else {
+            let (a, b) = (self.bilinear(fine, u, v), self.bilinear(fine + 1, u, v));
+            a + (b - a) * blend
+        };
+        grey / 128.0
+    }
+
+    /// As [`Level::bilinear`], but grey and wrapping around.
+    #[inline]
+    fn bilinear(&self, level: usize, u: f32, v: f32) -> f32 {
+        let (texels, side) = (&self.levels[level], Self::SIDE >> level);
+        let scale = 256.0 / (Self::TEXEL * (1_u32 << level) as f32);
+        let (x, y) = ((u * scale - 128.0) as i32, (v * scale - 128.0) as i32);
+        let (fx, fy) = ((x & 255) as u32, (y & 255) as u32);
+        let index = |i: i32| (i as usize) & (side - 1);
+        let (x0, x1) = (index(x >> 8), index((x >> 8) + 1));
+        let (y0, y1) = (index(y >> 8) * side, index((y >> 8) + 1) * side);
+        let line =
+            |y: usize| u32::from(texels[y + x0]) * (256 - fx) + u32::from(texels[y + x1]) * fx;
+        (line(y0) * (256 - fy) + line(y1) * fy) as f32 / 65536.0
     }
 }
 
@@ -289,14 +349,14 @@ impl<'a> Canvas<'a> {
         Area { x: 0.0, y: 0.0, width: self.width(), height: self.height() }
     }
 
-    fn finish(self, wraps: bool) -> Texture {
+    fn finish(self) -> Texture {
         let first = Level { width: self.columns, height: self.rows, texels: self.texels };
         let mut levels = vec![first];
         while let Some(last) = levels.last().filter(|l| l.width > 1 || l.height > 1) {
             let next = last.halved();
             levels.push(next);
         }
-        Texture { levels, texel: self.texel, wraps }
+        Texture { levels, texel: self.texel }
     }
 
     /// Blends `color` in where `distance` (m, relative to `center`) is negative, with soft edges.
@@ -579,7 +639,7 @@ pub fn paint(
             picture(&mut canvas, rng, whole);
         }
     }
-    canvas.finish(false)
+    canvas.finish()
 }
 
 fn wall(canvas: &mut Canvas, rng: &mut ChaCha8Rng, richness: f32) {
@@ -870,6 +930,22 @@ mod tests {
         let read = texture.sample(u, v, [1e-4, 0.0], [0.0, 1e-4]);
         let texel = level.texels[row * level.width + column];
         assert!((read[0] - f32::from(texel[0])).abs() < 0.5);
+    }
+
+    #[test]
+    fn grain_wraps_around_and_is_even_from_afar() {
+        let grain = Grain::new(&mut ChaCha8Rng::seed_from_u64(5));
+        let side = Grain::SIDE as f32 * Grain::TEXEL;
+        for (u, v) in [(0.01, 0.02), (0.2, 0.3001), (0.1234, 0.0)] {
+            let value = grain.factor(u, v, 1e-4);
+            assert!((grain.factor(u + side, v - side, 1e-4) - value).abs() < 1e-2, "{u} {v}");
+            assert!((grain.factor(u, v, 1.0) - 1.0).abs() < 0.02, "{u} {v}");
+        }
+        let values: Vec<f32> =
+            (0..1000).map(|k| grain.factor(0.0013 * k as f32, 0.0007 * k as f32, 1e-4)).collect();
+        let mean = values.iter().sum::<f32>() / 1000.0;
+        let sd = (values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / 1000.0).sqrt();
+        assert!((mean - 1.0).abs() < 0.05 && sd > 0.1, "{mean} {sd}");
     }
 
     #[test]

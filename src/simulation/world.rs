@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::texture::{Color, Material, Picture, Texture, paint};
+use super::texture::{Color, Grain, Material, Picture, Texture, paint};
 
 /// The room and what stands in it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -169,7 +169,7 @@ impl Solid {
         x: f32,
         y: f32,
         pixel: [f32; 2],
-        grain: &Texture,
+        grain: &Grain,
     ) -> Color {
         let direction = view.axes * Vector3::new(x, y, 1.0);
         let point = view.origin + direction * hit.distance;
@@ -188,9 +188,9 @@ impl Solid {
         let base = face.texture.sample(s, t, dx, dy);
         let mut factor = face.light_at(s, t);
         let spread = (dx[0] * dy[1] - dx[1] * dy[0]).abs().sqrt();
-        if spread < Texture::FINE_GRAIN_LIMIT {
-            let grey = grain.trilinear(s + face.grain_offset[0], t + face.grain_offset[1], spread);
-            factor *= 1.0 + face.grain_depth * (grey[0] / 128.0 - 1.0);
+        if spread < Grain::LIMIT {
+            let [ds, dt] = face.grain_offset;
+            factor *= 1.0 + face.grain_depth * (grain.factor(s + ds, t + dt, spread) - 1.0);
         }
         base.map(|c| c * factor)
     }
@@ -236,7 +236,7 @@ struct Plan {
 #[derive(Debug)]
 pub struct World {
     pub(super) solids: Vec<Solid>,
-    pub(super) grain: Texture,
+    pub(super) grain: Grain,
     /// Rounds of the people, whose boxes are the last of `solids`, three each.
     rounds: Vec<Round>,
 }
@@ -282,7 +282,7 @@ impl World {
         for _ in 0..room.clutter {
             furnish(&mut plans, room, path, &mut rng);
         }
-        let grain = Texture::fine_grain(&mut rng);
+        let grain = Grain::new(&mut rng);
         // People cast no shadows: light is baked once, without them.
         let bare: Vec<Solid> = plans.iter().map(Plan::solid).collect();
         let rounds: Vec<Round> =
