@@ -30,7 +30,7 @@ pub struct TrajectoryConfig {
     pub height: f64,
     /// Motion above this frequency is smoothed away as noise of the recording, Hz.
     pub cutoff: f64,
-    /// A gap between poses longer than this ends the trajectory; shorter ones are bridged, s.
+    /// A gap between poses longer than this ends the trajectory; the curve bridges shorter ones, s.
     pub max_gap: f64,
 }
 
@@ -43,7 +43,7 @@ impl Default for TrajectoryConfig {
             start: 0.0,
             height: 1.4,
             cutoff: 6.0,
-            max_gap: 0.25,
+            max_gap: 0.5,
         }
     }
 }
@@ -87,6 +87,9 @@ pub(super) struct Trajectory {
 
 /// Knots of the splines, s.
 const KNOTS: f64 = 0.05;
+
+/// Pauses between poses from here on are gaps that are told, s.
+const GAP: f64 = 0.05;
 
 impl Trajectory {
     /// Reads and fits the poses of the body in a z-up world whose origin lies on the floor below
@@ -191,15 +194,29 @@ fn uninterrupted<'a>(
     let origin = poses.first().map_or(Stamp::default(), |p| p.stamp);
     let skipped = poses.partition_point(|p| p.stamp.seconds_since(origin) < config.start);
     let rest = &poses[skipped..];
-    let gap = |pair: &[TruthPose]| pair[1].stamp.seconds_since(pair[0].stamp) > config.max_gap;
-    let end = rest.windows(2).position(gap).map_or(rest.len(), |k| k + 1);
+    let pause = |k: usize| rest[k + 1].stamp.seconds_since(rest[k].stamp);
+    let pauses = 0..rest.len().saturating_sub(1);
+    let end = pauses.clone().find(|k| pause(*k) > config.max_gap).map_or(rest.len(), |k| k + 1);
     let usable = match &rest[..end] {
         [first, .., last] => last.stamp.seconds_since(first.stamp),
         _ => 0.0,
     };
+    let (file, max_gap, start) = (config.file.display(), config.max_gap, config.start);
     if usable < 1.0 {
-        let (path, max_gap, start) = (config.file.clone(), config.max_gap, config.start);
+        let path = config.file.clone();
         return Err(TrajectoryError::TooShort { path, usable, max_gap, start });
+    }
+    let bridged: Vec<f64> = pauses.take(end - 1).map(pause).filter(|s| *s > GAP).collect();
+    if let Some(longest) = bridged.iter().copied().reduce(f64::max) {
+        tracing::info!("{file}: {} gaps bridged, the longest of {longest:.3} s", bridged.len());
+    }
+    if end < rest.len() {
+        tracing::warn!(
+            "{file}: {usable:.1} s are used, up to a gap of {:.3} s; the rest begins at \
+             trajectory.start = {:.1}",
+            pause(end - 1),
+            rest[end].stamp.seconds_since(origin)
+        );
     }
     Ok(&rest[..end])
 }
@@ -332,11 +349,11 @@ mod tests {
             stamp: Stamp::default().offset_by(t),
             world_from_body: Isometry3::identity(),
         };
-        let poses: Vec<TruthPose> =
-            (0..400).map(|k| pose(0.01 * f64::from(k) + if k < 250 { 0.0 } else { 1.0 })).collect();
+        let late = |k: i32| 0.4 * f64::from(u8::from(k >= 120)) + f64::from(u8::from(k >= 250));
+        let poses: Vec<TruthPose> = (0..400).map(|k| pose(0.01 * f64::from(k) + late(k))).collect();
         let config = TrajectoryConfig::default();
         assert_eq!(uninterrupted(&config, &poses).unwrap().len(), 250);
-        let config = TrajectoryConfig { start: 2.0, ..config };
+        let config = TrajectoryConfig { start: 2.4, ..config };
         let error = uninterrupted(&config, &poses).unwrap_err();
         assert!(matches!(error, TrajectoryError::TooShort { usable, .. } if usable < 0.6));
     }
