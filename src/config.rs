@@ -14,6 +14,7 @@ use crate::odometry::{HealthConfig, InitConfig, OdometryConfig, SearchConfig, Tr
 use crate::viewer::RecordingConfig;
 use crate::vision::{
     CameraConfig, DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig,
+    rectified_camera,
 };
 
 /// Everything a replay can be told, by section.
@@ -77,28 +78,53 @@ pub fn shipped_names() -> Vec<&'static str> {
 impl Config {
     /// The configuration that is shipped under `name`, with `overrides` (`section.key=value`).
     pub fn shipped(name: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let (_, text) = SHIPPED
-            .iter()
-            .find(|(shipped, _)| *shipped == name)
-            .ok_or_else(|| ConfigError::NotShipped { name: name.to_owned() })?;
-        parse(text, &format!("configs/{name}.toml"), overrides)
+        parse(shipped_text(name)?, &format!("configs/{name}.toml"), overrides)
     }
 
-    /// The configuration that fits a log: the shipped one for its layout, with the camera's
-    /// calibration where the log tells it, and `overrides`.
-    pub fn for_log(log: &LogSummary, overrides: &[String]) -> Result<Self, ConfigError> {
-        let shipped = Self::shipped(&log.config_name, &[])?;
-        let camera = log.camera.clone().unwrap_or_else(|| shipped.camera.clone());
-        let origin = format!("configs/{}.toml", log.config_name);
-        let text = toml::to_string(&Self { camera, ..shipped }).map_err(|error| {
+    /// The configuration for a log, with `overrides`: that of `file`, or the shipped one for the
+    /// log's layout with the camera's calibration where the log tells it. Where depth comes from
+    /// two cameras, their rectified image has the calibration that follows from theirs.
+    pub fn for_log(
+        log: &LogSummary,
+        file: Option<&Path>,
+        overrides: &[String],
+    ) -> Result<Self, ConfigError> {
+        let (text, origin) = match file {
+            Some(path) => (read(path)?, path.display().to_string()),
+            None => {
+                let name = &log.config_name;
+                (shipped_text(name)?.to_owned(), format!("configs/{name}.toml"))
+            }
+        };
+        let given: Self = parse(&text, &origin, overrides)?;
+        let told = log.camera.clone().filter(|_| file.is_none() || log.is_stereo());
+        let Some(camera) = told.or(given.rectified_camera(log, &origin)?) else {
+            return Ok(given);
+        };
+        // Keys that are set by hand count more than what the log tells.
+        let without_overrides: Self = parse(&text, &origin, &[])?;
+        let text = toml::to_string(&Self { camera, ..without_overrides }).map_err(|error| {
             ConfigError::Syntax { origin: origin.clone(), message: error.to_string() }
         })?;
         parse(&text, &origin, overrides)
     }
 
-    /// Reads `path` and applies `overrides` (`section.key=value`).
-    pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        parse(&read(path)?, &path.display().to_string(), overrides)
+    /// Where depth comes from two image topics.
+    fn rectified_camera(
+        &self,
+        log: &LogSummary,
+        origin: &str,
+    ) -> Result<Option<CameraConfig>, ConfigError> {
+        let [left, right] = &self.log.stereo[..] else { return Ok(None) };
+        let is_named = !["", "none"].contains(&self.log.right_topic.as_str());
+        if !is_named && !(log.is_stereo() && self.log.depth_topic.is_empty()) {
+            return Ok(None);
+        }
+        rectified_camera(left, right).map(Some).map_err(|error| ConfigError::BadValue {
+            origin: origin.to_owned(),
+            key: "log.stereo".to_owned(),
+            message: error.to_string(),
+        })
     }
 
     /// The sections that the pipeline behind the front end needs.
@@ -118,6 +144,12 @@ impl Config {
             health: self.health.clone(),
         }
     }
+}
+
+fn shipped_text(name: &str) -> Result<&'static str, ConfigError> {
+    let shipped = SHIPPED.iter().find(|(shipped, _)| *shipped == name);
+    let (_, text) = shipped.ok_or_else(|| ConfigError::NotShipped { name: name.to_owned() })?;
+    Ok(text)
 }
 
 impl GnssConfig {
@@ -232,6 +264,25 @@ mod tests {
         GnssConfig::shipped(&[]).unwrap();
         let given = flat_keys(&GNSS.parse().unwrap());
         assert_eq!(given.len(), valid_keys::<GnssConfig>().unwrap().len(), "{given:?}");
+    }
+
+    #[test]
+    fn two_cameras_decide_the_calibration_of_their_rectified_image() {
+        let shipped = Config::shipped("euroc", &[]).unwrap();
+        let [left, right] = &shipped.log.stereo[..] else { panic!("{:?}", shipped.log.stereo) };
+        let rectified = rectified_camera(left, right).unwrap();
+        let mounts = (rectified.imu_from_camera, shipped.camera.imu_from_camera);
+        for (computed, stated) in mounts.0.iter().flatten().zip(mounts.1.iter().flatten()) {
+            assert!((computed - stated).abs() < 1e-7, "{mounts:?}");
+        }
+        let mut log = LogSummary { config_name: "euroc".to_owned(), ..LogSummary::default() };
+        assert_eq!(Config::for_log(&log, None, &[]).unwrap().camera, shipped.camera);
+        log.sources.insert("right".to_owned(), "/cam1/image_raw".to_owned());
+        assert_eq!(Config::for_log(&log, None, &[]).unwrap().camera, rectified);
+        let overrides = ["camera.time_offset=0.01".to_owned()];
+        let fitted = Config::for_log(&log, None, &overrides).unwrap();
+        assert_eq!((fitted.camera.time_offset, fitted.camera.fx), (0.01, rectified.fx));
+        assert_eq!(fitted.log, shipped.log);
     }
 
     #[test]

@@ -2,8 +2,12 @@
 
 mod support;
 
+use std::collections::BTreeMap;
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock};
 
+use mfg_vio::config::Config;
 use mfg_vio::dataset::{LogConfig, open};
 use mfg_vio::inertial::{ImuConfig, Stamp};
 use mfg_vio::odometry::Event;
@@ -111,20 +115,42 @@ fn failures_name_the_file() {
     assert_eq!(mfg_vio(&["convert", log]).status.code(), Some(2));
 }
 
-/// A EuRoC folder of a simulated room, seen by two cameras side by side, and the log of the left
-/// one with the true depth.
-fn stereo_folder(folder: &Path) -> PathBuf {
-    const SCENE: &str = "duration = 3.0\n[room]\ntexel = 0.01\n[image]\nwidth = 320\nheight = 240\n\
-                         rate = 20.0\n";
-    let mounts = [0.0, BASELINE].map(|x| {
+/// A EuRoC folder of a simulated room, seen by two cameras side by side, and beside it the logs of
+/// both, `cam0.mcap` and `cam1.mcap`, with the true depth. Made once for the tests of this file.
+fn stereo_folder() -> &'static Path {
+    static FOLDER: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
+    let make = || {
+        let directory = tempfile::tempdir().unwrap();
+        let root = make_stereo_folder(directory.path());
+        (directory, root)
+    };
+    &FOLDER.get_or_init(make).1
+}
+
+/// The left and the right camera.
+fn cameras() -> [CameraConfig; 2] {
+    [0.0, BASELINE].map(|x| {
         let mount = CameraConfig { imu_from_camera: MOUNT, ..CameraConfig::default() };
         let mount = mount.imu_from_camera().unwrap() * Isometry3::translation(x, 0.0, 0.0);
-        mount.to_homogeneous()
-    });
+        let mount = mount.to_homogeneous();
+        CameraConfig {
+            fx: FOCAL,
+            fy: FOCAL,
+            cx: 159.5,
+            cy: 119.5,
+            imu_from_camera: std::array::from_fn(|r| std::array::from_fn(|c| mount[(r, c)])),
+            ..CameraConfig::default()
+        }
+    })
+}
+
+fn make_stereo_folder(folder: &Path) -> PathBuf {
+    const SCENE: &str = "duration = 3.0\n[room]\ntexel = 0.01\n[image]\nwidth = 320\nheight = 240\n\
+                         rate = 20.0\n";
+    let mounts = cameras().map(|camera| camera.imu_from_camera);
     let root = folder.join("mav0");
     for (name, mount) in ["cam0", "cam1"].iter().zip(mounts) {
-        let rows =
-            |row| (0..4).map(|c| format!("{:.9}", mount[(row, c)])).collect::<Vec<_>>().join(", ");
+        let rows = |row: usize| mount[row].map(|number| format!("{number:.9}")).join(", ");
         let camera = format!(
             "[camera]\nfx = {FOCAL}\nfy = {FOCAL}\ncx = 159.5\ncy = 119.5\n\
              imu_from_camera = [[{}], [{}], [{}], [{}]]\n",
@@ -186,25 +212,26 @@ const FOCAL: f64 = 230.0;
 const MOUNT: [[f64; 4]; 4] =
     [[0.0, -1.0, 0.0, -0.02], [-1.0, 0.0, 0.0, 0.03], [0.0, 0.0, -1.0, 0.01], [0.0, 0.0, 0.0, 1.0]];
 
+fn frames(path: &Path, log: &LogConfig) -> Vec<RgbdFrame> {
+    let frame = |event| match event {
+        Event::Frame(frame) => Some(*frame),
+        _ => None,
+    };
+    events(path, log).into_iter().filter_map(frame).collect()
+}
+
 #[test]
 fn stereo_folders_have_the_depth_of_their_disparity() {
     let directory = tempfile::tempdir().unwrap();
-    let folder = stereo_folder(directory.path());
-    let found = json(&["info", text(&folder), "--json"]);
+    let folder = stereo_folder();
+    let found = json(&["info", text(folder), "--json"]);
     assert_eq!((&found["kind"], &found["config_name"]), (&"EuRoC folder".into(), &"euroc".into()));
     assert_eq!(found["verdict"]["fit"], true, "{found:#}");
     assert_eq!(found["pairs"]["frames"], 61);
 
-    let frames = |path: &Path| -> Vec<RgbdFrame> {
-        let frame = |event| match event {
-            Event::Frame(frame) => Some(*frame),
-            _ => None,
-        };
-        events(path, &LogConfig::default()).into_iter().filter_map(frame).collect()
-    };
-    let stereo = frames(&folder);
+    let stereo = frames(folder, &LogConfig::default());
     // The cameras are parallel: the left image is rectified as it is.
-    let truth = frames(&directory.path().join("cam0.mcap"));
+    let truth = frames(&folder.with_file_name("cam0.mcap"), &LogConfig::default());
     assert_eq!(stereo.len(), 61);
     let mut errors = Vec::new();
     for (stereo, truth) in stereo.iter().zip(&truth).step_by(10) {
@@ -222,8 +249,8 @@ fn stereo_folders_have_the_depth_of_their_disparity() {
     assert!(part(68) < 0.5 && part(90) < 2.0, "{} {}", part(68), part(90));
 
     let copy = directory.path().join("stereo.mcap");
-    succeed(&["convert", text(&folder), text(&copy)]);
-    assert_eq!(frames(&copy), stereo);
+    succeed(&["convert", text(folder), text(&copy)]);
+    assert_eq!(frames(&copy, &LogConfig::default()), stereo);
     let again = json(&["info", text(&copy), "--json"]);
     assert_eq!(again["config_name"], "euroc");
     assert_eq!(again["camera"], found["camera"]);
@@ -233,4 +260,88 @@ fn stereo_folders_have_the_depth_of_their_disparity() {
         let rmse = metrics["evaluation"]["ape_translation"]["rmse"].as_f64().unwrap();
         assert!(rmse < 0.05, "{rmse}");
     }
+}
+
+/// The recording of [`stereo_folder`] with its images on two topics.
+fn stereo_topics(path: &Path) {
+    let mut messages = Vec::new();
+    let topics = [
+        ("cam0", "/cam0/color", "/cam0/image_raw"),
+        ("cam1", "/cam0/color", "/cam1/image_raw"),
+        ("cam0", "/imu", "/imu0"),
+        ("cam0", "/truth/pose", "/truth/pose"),
+    ];
+    for (log, from, to) in topics {
+        let bytes = std::fs::read(stereo_folder().with_file_name(format!("{log}.mcap"))).unwrap();
+        for message in mcap::MessageStream::new(&bytes).unwrap() {
+            let message = message.unwrap();
+            if message.channel.topic == from {
+                let data = message.data.to_vec();
+                let schema = message.channel.schema.clone().unwrap();
+                messages.push((
+                    message.log_time,
+                    to,
+                    schema.name.clone(),
+                    schema.data.to_vec(),
+                    data,
+                ));
+            }
+        }
+    }
+    messages.sort_by_key(|message| message.0);
+    let mut writer = mcap::Writer::new(Cursor::new(Vec::new())).unwrap();
+    for (log_time, topic, schema, definition, data) in messages {
+        let schema = writer.add_schema(&schema, "ros2msg", &definition).unwrap();
+        let channel_id = writer.add_channel(schema, topic, "cdr", &BTreeMap::new()).unwrap();
+        let header = mcap::records::MessageHeader {
+            channel_id,
+            sequence: 0,
+            log_time,
+            publish_time: log_time,
+        };
+        writer.write_to_known_channel(&header, &data).unwrap();
+    }
+    writer.finish().unwrap();
+    std::fs::write(path, writer.into_inner().into_inner()).unwrap();
+}
+
+#[test]
+fn stereo_topics_have_the_depth_of_their_disparity() {
+    let directory = tempfile::tempdir().unwrap();
+    let (log, copy) = (directory.path().join("log.mcap"), directory.path().join("copy.mcap"));
+    stereo_topics(&log);
+    let mut config = Config::shipped("euroc", &[]).unwrap();
+    config.log.stereo = cameras().into();
+    let file = directory.path().join("rig.toml");
+    std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
+
+    let found = json(&["info", text(&log), "--config", text(&file), "--json"]);
+    assert_eq!(found["config_name"], "euroc");
+    assert_eq!(found["verdict"]["fit"], true, "{found:#}");
+    assert_eq!(found["pairs"]["frames"], 61);
+    assert_eq!(found["camera"]["fx"], FOCAL);
+    // As from the folder, whose images are grey.
+    let stereo = frames(&log, &config.log);
+    let in_folder = frames(stereo_folder(), &LogConfig::default());
+    let measured = |frames: &[RgbdFrame]| {
+        frames.iter().flat_map(|frame| frame.depth.data()).filter(|raw| **raw > 0).count() as f64
+    };
+    assert_eq!(stereo.len(), in_folder.len());
+    assert!((measured(&stereo) / measured(&in_folder) - 1.0).abs() < 0.1);
+
+    succeed(&["convert", text(&log), text(&copy), "--config", text(&file)]);
+    assert_eq!(frames(&copy, &LogConfig::default()), stereo);
+    if cfg!(feature = "vision") {
+        let metrics = json(&["replay", text(&log), "--config", text(&file), "--json"]);
+        let rmse = metrics["evaluation"]["ape_translation"]["rmse"].as_f64().unwrap();
+        assert!(rmse < 0.05, "{rmse}");
+    }
+
+    // Without the calibrations.
+    let naive = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/sim.toml");
+    let found = json(&["info", text(&log), "--config", text(&naive), "--json"]);
+    assert_eq!(found["verdict"]["fit"], false);
+    assert!(found["verdict"]["text"].as_str().unwrap().contains("`log.stereo`"), "{found:#}");
+    let error = open(&log, &LogConfig::default(), &ImuConfig::default()).err().unwrap();
+    assert!(error.to_string().contains("`log.stereo`"), "{error}");
 }

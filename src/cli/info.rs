@@ -36,10 +36,7 @@ pub struct Setup {
 
 impl Setup {
     pub fn config(&self, summary: &LogSummary) -> anyhow::Result<Config> {
-        Ok(match &self.config {
-            Some(path) => Config::load(path, &self.overrides)?,
-            None => Config::for_log(summary, &self.overrides)?,
-        })
+        Ok(Config::for_log(summary, self.config.as_deref(), &self.overrides)?)
     }
 }
 
@@ -47,7 +44,8 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let summary = dataset::detect(&args.log)?;
     let config = args.setup.config(&summary)?;
     // A layout that is merely not known says nothing about the mounting of the camera.
-    let is_known = args.setup.config.is_some() || summary.config_name == "vcu_rvi";
+    let is_known =
+        args.setup.config.is_some() || summary.is_stereo() || summary.config_name == "vcu_rvi";
     let camera = summary.camera.as_ref().or(is_known.then_some(&config.camera));
     let body_from_camera = camera.and_then(CameraConfig::imu_from_camera);
     let assumed = Assumed { log: &config.log, imu: &config.imu, body_from_camera };

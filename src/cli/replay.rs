@@ -128,15 +128,16 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 fn load_config(args: &Args, summary: &LogSummary) -> anyhow::Result<(Config, String)> {
-    let overrides = &args.settings.overrides;
-    match &args.config {
-        Some(path) => Ok((Config::load(path, overrides)?, path.display().to_string())),
+    let config = Config::for_log(summary, args.config.as_deref(), &args.settings.overrides)?;
+    let origin = match &args.config {
+        Some(path) => path.display().to_string(),
         None => {
             let name = &summary.config_name;
             tracing::info!("{}: using the shipped configuration `{name}`", summary.kind);
-            Ok((Config::for_log(summary, overrides)?, name.clone()))
+            name.clone()
         }
-    }
+    };
+    Ok((config, origin))
 }
 
 /// Where a recording goes.

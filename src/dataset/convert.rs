@@ -1,8 +1,8 @@
 //! Logs of all kinds to MCAP files of ROS 2 messages.
 //!
 //! Messages keep their content, header stamps and log times; ROS 1 messages are serialised anew
-//! by their definitions, whatever their type. Folders become the messages of [`LogWriter`], whose
-//! log times are their stamps.
+//! by their definitions, whatever their type. Folders, and logs of two cameras without depth, become
+//! the messages of [`LogWriter`], whose log times are their stamps.
 
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
@@ -15,7 +15,7 @@ use super::message::{self, Fields, MessageType, Serialization};
 use super::open::{Contents, MessageLog};
 use super::output::McapOutput;
 use super::pixels::Rejection;
-use super::ros::{Channel, Message};
+use super::ros::{Channel, Message, Role, Survey};
 use super::ros2;
 use super::{
     Event, LogConfig, LogError, LogWriter, LogWriterOptions, ReadReport, WriteError, open,
@@ -57,7 +57,7 @@ pub fn convert(
     output: &Path,
     log: &LogConfig,
     camera: &CameraConfig,
-    mut progress: impl FnMut() -> ControlFlow<()>,
+    progress: impl FnMut() -> ControlFlow<()>,
 ) -> Result<ConvertSummary, ConvertError> {
     log.validate()?;
     let same = |a: &Path, b: &Path| Some(a.canonicalize().ok()? == b.canonicalize().ok()?);
@@ -65,36 +65,51 @@ pub fn convert(
         return Err(ConvertError::SameFile(output.to_owned()));
     }
     match Contents::of(input, log)? {
-        Contents::Messages(messages) => convert_messages(&messages, output, log, progress),
-        Contents::Folder(..) => {
-            let mut events = open(input, log, &ImuConfig::default())?;
-            let configuration = events.summary().config_name.clone();
-            let camera = events.summary().camera.clone().unwrap_or_else(|| camera.clone());
-            let options = LogWriterOptions { configuration, ..LogWriterOptions::default() };
-            let mut writer = LogWriter::create(output, options)?;
-            let mut has_camera = false;
-            while let Some(event) = events.next_event() {
-                if !has_camera && matches!(event, Event::Frame(_)) {
-                    writer.camera_info(&camera, event.stamp())?;
-                    has_camera = true;
-                }
-                writer.event(&event)?;
-                if progress().is_break() {
-                    break;
-                }
-            }
-            let written = writer.finish()?;
-            let messages = [
-                ("frames", written.frames),
-                ("IMU samples", written.imu_samples),
-                ("truth poses", written.truth_poses),
-            ];
-            Ok(ConvertSummary {
-                messages: messages.map(|(name, count)| (name.to_owned(), count)).into(),
-                skipped: events.report().skipped.clone(),
-            })
+        Contents::Messages(messages) if !is_stereo(&messages, log) => {
+            convert_messages(&messages, output, log, progress)
+        }
+        _ => convert_events(input, output, (log, camera), progress),
+    }
+}
+
+/// Whether depth is to be computed from two cameras.
+fn is_stereo(messages: &MessageLog, log: &LogConfig) -> bool {
+    let chosen = Survey::new(messages.messages().as_mut()).choose(log);
+    !log.stereo.is_empty() && chosen.is_ok_and(|chosen| chosen.contains_key(&Role::Right))
+}
+
+fn convert_events(
+    input: &Path,
+    output: &Path,
+    (log, camera): (&LogConfig, &CameraConfig),
+    mut progress: impl FnMut() -> ControlFlow<()>,
+) -> Result<ConvertSummary, ConvertError> {
+    let mut events = open(input, log, &ImuConfig::default())?;
+    let configuration = events.summary().config_name.clone();
+    let camera = events.summary().camera.clone().unwrap_or_else(|| camera.clone());
+    let options = LogWriterOptions { configuration, ..LogWriterOptions::default() };
+    let mut writer = LogWriter::create(output, options)?;
+    let mut has_camera = false;
+    while let Some(event) = events.next_event() {
+        if !has_camera && matches!(event, Event::Frame(_)) {
+            writer.camera_info(&camera, event.stamp())?;
+            has_camera = true;
+        }
+        writer.event(&event)?;
+        if progress().is_break() {
+            break;
         }
     }
+    let written = writer.finish()?;
+    let messages = [
+        ("frames", written.frames),
+        ("IMU samples", written.imu_samples),
+        ("truth poses", written.truth_poses),
+    ];
+    Ok(ConvertSummary {
+        messages: messages.map(|(name, count)| (name.to_owned(), count)).into(),
+        skipped: events.report().skipped.clone(),
+    })
 }
 
 fn convert_messages(

@@ -143,10 +143,6 @@ fn camera(folder: &Path) -> Result<(CameraConfig, (usize, usize)), LogError> {
     let [k1, k2, p1, p2] =
         of(list("distortion_coefficients")).ok_or_else(|| missing("distortion_coefficients"))?;
     let [width, height] = of(list("resolution")).ok_or_else(|| missing("resolution"))?;
-    let usable = |size: f64| (16.0..=8192.0).contains(&size);
-    if !(usable(width) && usable(height)) {
-        return Err(missing("resolution"));
-    }
     let camera = CameraConfig {
         fx,
         fy,

@@ -44,6 +44,13 @@ pub struct LogSummary {
     pub camera: Option<CameraConfig>,
 }
 
+impl LogSummary {
+    /// Whether depth comes from two cameras.
+    pub fn is_stereo(&self) -> bool {
+        self.sources.contains_key("right")
+    }
+}
+
 /// A log that is being read. Events come ordered by stamp; memory stays bounded.
 ///
 /// A bad message is left out, counted in [`Log::report`] and warned of; it never ends the run.
@@ -64,6 +71,9 @@ pub struct LogConfig {
     pub color_topic: String,
     /// Topic of the depth image; empty: chosen by message type and encoding; `"none"`: not used.
     pub depth_topic: String,
+    /// Topic of the right one of two cameras, of which `color_topic` is the left one; empty: a
+    /// second image like the color image where there is no depth; `"none"`: not used.
+    pub right_topic: String,
     /// Topic of the IMU; empty: chosen by message type; `"none"`: not used.
     pub imu_topic: String,
     /// Topic of the reference poses; empty: chosen by message type; `"none"`: not used.
@@ -78,6 +88,8 @@ pub struct LogConfig {
     pub max_pair_difference: f64,
     /// How far messages may arrive out of order before they are left out, s.
     pub reorder_window: f64,
+    /// The left and the right camera as their topics are logged; empty where depth is logged.
+    pub stereo: Vec<CameraConfig>,
 }
 
 impl Default for LogConfig {
@@ -85,6 +97,7 @@ impl Default for LogConfig {
         Self {
             color_topic: String::new(),
             depth_topic: String::new(),
+            right_topic: String::new(),
             imu_topic: String::new(),
             truth_topic: String::new(),
             color_8uc3: "bgr".to_owned(),
@@ -92,6 +105,7 @@ impl Default for LogConfig {
             depth_invalid: vec![65535],
             max_pair_difference: 0.02,
             reorder_window: 0.5,
+            stereo: Vec::new(),
         }
     }
 }
@@ -106,6 +120,10 @@ impl LogConfig {
         }
         if !(self.depth_scale as f32 > 0.0 && self.depth_scale.is_finite()) {
             return error("depth_scale", self.depth_scale.to_string(), "a positive number");
+        }
+        if ![0, 2].contains(&self.stereo.len()) {
+            let count = format!("[{} cameras]", self.stereo.len());
+            return error("stereo", count, "the left and the right camera, or none");
         }
         let times = [
             ("max_pair_difference", self.max_pair_difference),
@@ -133,6 +151,8 @@ pub enum LogError {
     Corrupt { path: PathBuf, reason: String },
     #[error("{path}: no {role} in this log; it has: {available}")]
     MissingStream { path: PathBuf, role: &'static str, available: String },
+    #[error("{path}: no depth, and none from its two cameras: {reason}")]
+    Stereo { path: PathBuf, reason: String },
     #[error("log.{key} = {value}: expected {expected}")]
     Config { key: &'static str, value: String, expected: &'static str },
 }

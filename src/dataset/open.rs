@@ -6,13 +6,14 @@ use std::path::Path;
 use super::bag::{Bag, BagFormat};
 use super::folder::{FolderSource, Listing};
 use super::mcap_file::{McapFile, McapFormat};
-use super::merge::MergedLog;
+use super::merge::{MergedLog, ReadingSource};
 use super::records::Format as _;
 use super::ros::{MessageSource, RosSource, Survey};
 use super::section::LogFile;
 use super::stereo::StereoSource;
 use super::{Log, LogConfig, LogError, LogSummary, euroc, seven_scenes, tum};
 use crate::inertial::ImuConfig;
+use crate::vision::StereoRig;
 
 /// What a path turned out to be.
 pub(super) enum Contents {
@@ -52,15 +53,17 @@ impl MessageLog {
 /// Opens a log for reading.
 ///
 /// The format is guessed from the content: MCAP, ROS 1 bag, TUM RGB-D, EuRoC or 7-Scenes folder.
-/// Depth of a EuRoC folder comes from matching its two cameras. Topics
-/// that `log` leaves open are chosen by message type, which is logged. `imu` gives the units of
+/// Where two cameras take the place of depth (a EuRoC folder, or image topics with `log.stereo`),
+/// it comes from matching them. Topics that `log` leaves open are chosen by message type, which is
+/// logged. `imu` gives the units of
 /// the IMU. A log without IMU is allowed ([`LogSummary::has_imu`]); if `log.color_topic` and
 /// `log.depth_topic` are `"none"`, so is one without images.
 ///
 /// # Errors
 /// [`LogError::UnknownFormat`] if it is none of these, [`LogError::MissingStream`] if color,
-/// depth or a configured topic is not there, [`LogError::Config`] if a key of `log` has no
-/// meaning, [`LogError::Io`] if it cannot be read.
+/// depth or a configured topic is not there, [`LogError::Stereo`] if there are two cameras that
+/// give no depth, [`LogError::Config`] if a key of `log` has no meaning, [`LogError::Io`] if it
+/// cannot be read.
 pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log>, LogError> {
     log.validate()?;
     Ok(match Contents::of(path, log)? {
@@ -69,10 +72,7 @@ pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log
             let stereo = listing.stereo.clone();
             let source = FolderSource::new(listing, log, imu);
             match stereo {
-                Some(rig) => {
-                    let source = StereoSource::new(source, rig, log);
-                    Box::new(MergedLog::new(source, summary, log))
-                }
+                Some(rig) => stereo_log(source, summary, rig, log),
                 None => {
                     // The entries are sorted already.
                     let sorted = LogConfig { reorder_window: 0.0, ..log.clone() };
@@ -83,10 +83,23 @@ pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log
         Contents::Messages(messages) => {
             let survey = Survey::new(messages.messages().as_mut());
             let place = (path, messages.kind());
-            let (source, summary) = RosSource::new(messages.messages(), &survey, place, log, imu)?;
-            Box::new(MergedLog::new(source, summary, log))
+            let (source, summary, rig) =
+                RosSource::new(messages.messages(), &survey, place, log, imu)?;
+            match rig {
+                Some(rig) => stereo_log(source, summary, rig, log),
+                None => Box::new(MergedLog::new(source, summary, log)),
+            }
         }
     })
+}
+
+fn stereo_log(
+    source: impl ReadingSource + 'static,
+    summary: LogSummary,
+    rig: StereoRig,
+    log: &LogConfig,
+) -> Box<dyn Log> {
+    Box::new(MergedLog::new(StereoSource::new(source, rig, log), summary, log))
 }
 
 /// Tells what a log is, and which configuration fits it, from its first messages.

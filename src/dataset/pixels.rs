@@ -180,7 +180,18 @@ pub(super) fn compressed_depth(bytes: &[u8], config: &LogConfig) -> Result<Depth
     new_depth(width, height, config.depth_scale as f32, data)
 }
 
+/// Width and height of a JPEG or PNG file in memory, by its head.
+pub(super) fn compressed_size(bytes: &[u8]) -> Option<(u32, u32)> {
+    compressed(bytes).ok()?.into_dimensions().ok()
+}
+
 fn decompress(bytes: &[u8]) -> Result<DynamicImage, Rejection> {
+    compressed(bytes)?
+        .decode()
+        .map_err(|error| Rejection::new("cannot be decompressed", error.to_string()))
+}
+
+fn compressed(bytes: &[u8]) -> Result<ImageReader<Cursor<&[u8]>>, Rejection> {
     let format = match bytes {
         [0xff, 0xd8, ..] => ImageFormat::Jpeg,
         [0x89, b'P', b'N', b'G', ..] => ImageFormat::Png,
@@ -190,7 +201,7 @@ fn decompress(bytes: &[u8]) -> Result<DynamicImage, Rejection> {
     limits.max_alloc = Some(LARGEST_IMAGE);
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(limits);
-    reader.decode().map_err(|error| Rejection::new("cannot be decompressed", error.to_string()))
+    Ok(reader)
 }
 
 fn new_color(

@@ -7,13 +7,13 @@ use std::path::Path;
 use super::merge::{Reading, ReadingSource};
 use super::message::{self, Fields, MessageType, Serialization};
 use super::pixels::{
-    Rejection, color_format, compressed_color, compressed_depth, is_depth_encoding, raw_color,
-    raw_depth,
+    Rejection, color_format, compressed_color, compressed_depth, compressed_size,
+    is_depth_encoding, raw_color, raw_depth,
 };
 use super::write::{CAMERA, CONFIGURATION};
 use super::{LogConfig, LogError, LogSummary, ReadReport};
 use crate::inertial::{ImuConfig, Stamp};
-use crate::vision::{CameraConfig, PixelFormat};
+use crate::vision::{CameraConfig, PixelFormat, StereoRig};
 
 /// A connection of a bag or a channel of an MCAP file.
 #[derive(Debug, Clone, PartialEq)]
@@ -95,7 +95,8 @@ pub(super) enum Role {
 }
 
 impl Role {
-    const ALL: [Self; 4] = [Self::Color, Self::Depth, Self::Imu, Self::Truth];
+    /// A topic is chosen for the right camera once it is known that there is no depth.
+    const ALL: [Self; 5] = [Self::Color, Self::Depth, Self::Right, Self::Imu, Self::Truth];
 
     /// Its key in [`LogSummary::sources`].
     fn key(self) -> &'static str {
@@ -128,7 +129,7 @@ impl Role {
             Self::Depth => &config.depth_topic,
             Self::Imu => &config.imu_topic,
             Self::Truth => &config.truth_topic,
-            Self::Right => "none",
+            Self::Right => &config.right_topic,
         }
     }
 
@@ -213,7 +214,9 @@ impl Topic {
                 is_depth_encoding(encoding?).then_some(u32::from(self.size != color_size))
             }
             Role::Depth => message::is_depth_format(encoding?).then_some(2),
-            Role::Right => None,
+            Role::Right => {
+                self.rank(name, Role::Color, color_size).filter(|_| self.size == color_size)
+            }
             Role::Imu => Some(u32::from(self.accelerations.is_empty())),
             Role::Truth => match kind {
                 MessageType::PoseStamped => Some(0),
@@ -246,7 +249,8 @@ pub(super) fn encoding_and_size(message: &Message) -> Result<EncodingAndSize, Re
             (Some(image.encoding.to_owned()), Some((image.width, image.height)))
         }
         MessageType::CompressedImage => {
-            (Some(message::compressed_image(fields)?.format.to_owned()), None)
+            let image = message::compressed_image(fields)?;
+            (Some(image.format.to_owned()), compressed_size(image.data))
         }
         _ => (None, None),
     })
@@ -319,6 +323,9 @@ impl Survey {
             let topic = self.topics.get(name);
             topic.is_some_and(|topic| topic.kind.is_some_and(|kind| role.takes(kind)))
         };
+        if is("/cam0/image_raw", Role::Color) && is("/cam1/image_raw", Role::Right) {
+            return "euroc";
+        }
         let layout = is("/cam0/color", Role::Color)
             && is("/cam0/depth", Role::Depth)
             && is("/imu", Role::Imu);
@@ -329,11 +336,14 @@ impl Survey {
 
     /// Chooses a topic for each role; `Err` names the first that is configured but not there.
     pub fn choose(&self, config: &LogConfig) -> Result<BTreeMap<Role, String>, Role> {
-        let mut chosen = BTreeMap::new();
+        let mut chosen: BTreeMap<Role, String> = BTreeMap::new();
         let mut color_size = None;
+        let has_right = !["", "none"].contains(&config.right_topic.as_str());
         for role in Role::ALL {
             let name = match role.configured(config) {
                 "none" => None,
+                "" if role == Role::Depth && has_right => None,
+                "" if role == Role::Right => self.partner(config, &chosen, color_size),
                 "" => self.best(role, color_size),
                 wanted => match self.topics.get_key_value(wanted) {
                     Some((name, topic)) if topic.kind.is_some_and(|kind| role.takes(kind)) => {
@@ -352,10 +362,53 @@ impl Survey {
         Ok(chosen)
     }
 
+    /// The second of two cameras, where depth is wanted and not logged.
+    fn partner(
+        &self,
+        config: &LogConfig,
+        chosen: &BTreeMap<Role, String>,
+        color_size: Option<(u32, u32)>,
+    ) -> Option<&String> {
+        let color = chosen.get(&Role::Color)?;
+        if chosen.contains_key(&Role::Depth) || !config.depth_topic.is_empty() {
+            return None;
+        }
+        let encoding = &self.topics.get(color)?.encoding;
+        let is_like_color = |name: &String, topic: &Topic| {
+            name != color
+                && topic.encoding == *encoding
+                && topic.rank(name, Role::Right, color_size).is_some()
+        };
+        self.topics.iter().find(|(name, topic)| is_like_color(name, topic)).map(|(name, _)| name)
+    }
+
+    /// The two cameras, where depth comes from them.
+    pub fn rig(
+        &self,
+        path: &Path,
+        chosen: &BTreeMap<Role, String>,
+        config: &LogConfig,
+    ) -> Result<Option<StereoRig>, LogError> {
+        if !chosen.contains_key(&Role::Right) {
+            return Ok(None);
+        }
+        let failed = |reason: String| LogError::Stereo { path: path.to_path_buf(), reason };
+        let [left, right] = &config.stereo[..] else {
+            return Err(failed("set their calibrations in `log.stereo`".to_owned()));
+        };
+        let color = chosen.get(&Role::Color).and_then(|name| self.topics.get(name));
+        let Some((width, height)) = color.and_then(|topic| topic.size) else {
+            return Err(failed("no image of the left one could be read".to_owned()));
+        };
+        StereoRig::new(left, right, (width as usize, height as usize))
+            .map(Some)
+            .map_err(|error| failed(error.to_string()))
+    }
+
     /// Without the demand that the log be complete.
     pub fn summary(&self, kind: &str) -> LogSummary {
         let chosen = self.choose(&LogConfig::default()).unwrap_or_default();
-        self.summary_of(kind, &chosen)
+        self.summary_of(kind, &chosen, None)
     }
 
     /// `role` is not there.
@@ -364,7 +417,12 @@ impl Survey {
         LogError::MissingStream { path: path.to_path_buf(), role: role.name(), available }
     }
 
-    pub fn summary_of(&self, kind: &str, chosen: &BTreeMap<Role, String>) -> LogSummary {
+    pub fn summary_of(
+        &self,
+        kind: &str,
+        chosen: &BTreeMap<Role, String>,
+        rig: Option<&StereoRig>,
+    ) -> LogSummary {
         LogSummary {
             kind: kind.to_owned(),
             config_name: self.config_name().to_owned(),
@@ -375,7 +433,7 @@ impl Survey {
                 .map(|(role, name)| (role.key().to_owned(), name.clone()))
                 .collect(),
             frames: None,
-            camera: self.camera.clone(),
+            camera: rig.map(StereoRig::camera).or(self.camera.as_ref()).cloned(),
         }
     }
 }
@@ -389,18 +447,21 @@ pub(super) struct RosSource {
 }
 
 impl RosSource {
-    /// `messages` from the start; `path` and `kind` for errors and the summary.
+    /// `messages` from the start; `path` and `kind` for errors and the summary. Where depth comes
+    /// from two cameras, these too.
     pub fn new(
         mut messages: Box<dyn MessageSource>,
         survey: &Survey,
         (path, kind): (&Path, &str),
         log: &LogConfig,
         imu: &ImuConfig,
-    ) -> Result<(Self, LogSummary), LogError> {
+    ) -> Result<(Self, LogSummary, Option<StereoRig>), LogError> {
         let missing = |role: Role| survey.missing(path, role);
         let chosen = survey.choose(log).map_err(missing)?;
+        let rig = survey.rig(path, &chosen, log)?;
         for role in [Role::Color, Role::Depth] {
-            if role.configured(log) != "none" && !chosen.contains_key(&role) {
+            let is_computed = role == Role::Depth && rig.is_some();
+            if role.configured(log) != "none" && !chosen.contains_key(&role) && !is_computed {
                 return Err(missing(role));
             }
         }
@@ -410,9 +471,9 @@ impl RosSource {
             }
         }
         messages.only(chosen.values().cloned().collect());
-        let summary = survey.summary_of(kind, &chosen);
+        let summary = survey.summary_of(kind, &chosen, rig.as_ref());
         let roles = chosen.into_iter().map(|(role, topic)| (topic, role)).collect();
-        Ok((Self { messages, roles, log: log.clone(), imu: imu.clone() }, summary))
+        Ok((Self { messages, roles, log: log.clone(), imu: imu.clone() }, summary, rig))
     }
 }
 

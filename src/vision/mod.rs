@@ -27,4 +27,4 @@ pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_g
 pub use orb::{OrbExtractor, VisionError};
 pub use patch::{Patch, PatchConfig};
 pub use ransac::{Correspondence, RansacConfig, estimate_pose};
-pub use stereo::{StereoError, StereoRig};
+pub use stereo::{StereoError, StereoRig, rectified_camera};

@@ -4,6 +4,8 @@
 //! `sigma_d` moves it by `sigma_z = z^2 sigma_d / (f b)`: the quadratic law of
 //! [`DepthConfig`](super::DepthConfig), with `noise_quadratic = sigma_d / (f b)`.
 
+use std::ops::RangeInclusive;
+
 use nalgebra::{Isometry3, Matrix3, Point2, Rotation3, Vector3};
 
 use super::{CameraConfig, ColorImage, DepthImage, PinholeCamera, PixelFormat};
@@ -38,6 +40,8 @@ pub enum StereoError {
     Baseline(f64),
     #[error("the second camera is not to the right of the first")]
     Order,
+    #[error("images of {0}x{1} pixels")]
+    Size(usize, usize),
 }
 
 /// Two cameras, and how their images are turned so that rows correspond.
@@ -51,13 +55,25 @@ pub struct StereoRig {
     right: Vec<Point2<f32>>,
 }
 
-impl StereoRig {
-    /// Cameras with their mountings on a common body, for images of `size` (width, height).
-    pub fn new(
-        left: &CameraConfig,
-        right: &CameraConfig,
-        size: (usize, usize),
-    ) -> Result<Self, StereoError> {
+/// The left camera as it would be if both looked straight across their baseline, rows of their
+/// images corresponding; cameras with their mountings on a common body.
+pub fn rectified_camera(
+    left: &CameraConfig,
+    right: &CameraConfig,
+) -> Result<CameraConfig, StereoError> {
+    Rectification::new(left, right).map(|rectification| rectification.camera)
+}
+
+struct Rectification {
+    /// The rectified left camera.
+    camera: CameraConfig,
+    baseline: f64,
+    left_from_rectified: Rotation3<f64>,
+    right_from_rectified: Rotation3<f64>,
+}
+
+impl Rectification {
+    fn new(left: &CameraConfig, right: &CameraConfig) -> Result<Self, StereoError> {
         let body_from_left = left.imu_from_camera().ok_or(StereoError::Mounting("left"))?;
         let body_from_right = right.imu_from_camera().ok_or(StereoError::Mounting("right"))?;
         let left_from_right = body_from_left.inv_mul(&body_from_right);
@@ -78,26 +94,38 @@ impl StereoRig {
         let right_from_rectified =
             left_from_right.rotation.to_rotation_matrix().inverse() * left_from_rectified;
         let focal = 0.25 * (left.fx + left.fy + right.fx + right.fy);
-        let pinhole = PinholeCamera {
-            fx: focal,
-            fy: focal,
-            cx: 0.5 * (size.0 as f64 - 1.0),
-            cy: 0.5 * (size.1 as f64 - 1.0),
-        };
         let body_from_rectified =
             body_from_left * Isometry3::from_parts(Default::default(), left_from_rectified.into());
         let matrix = body_from_rectified.to_homogeneous();
         let camera = CameraConfig {
-            fx: pinhole.fx,
-            fy: pinhole.fy,
-            cx: pinhole.cx,
-            cy: pinhole.cy,
+            fx: focal,
+            fy: focal,
+            cx: 0.5 * (left.cx + right.cx),
+            cy: 0.5 * (left.cy + right.cy),
             distortion: [0.0; 5],
             imu_from_camera: std::array::from_fn(|row| {
                 std::array::from_fn(|column| matrix[(row, column)])
             }),
             time_offset: left.time_offset,
         };
+        Ok(Self { camera, baseline, left_from_rectified, right_from_rectified })
+    }
+}
+
+impl StereoRig {
+    /// Cameras with their mountings on a common body, for images of `size` (width, height).
+    pub fn new(
+        left: &CameraConfig,
+        right: &CameraConfig,
+        size: (usize, usize),
+    ) -> Result<Self, StereoError> {
+        const SIDES: RangeInclusive<usize> = 16..=8192;
+        if !(SIDES.contains(&size.0) && SIDES.contains(&size.1)) {
+            return Err(StereoError::Size(size.0, size.1));
+        }
+        let Rectification { camera, baseline, left_from_rectified, right_from_rectified } =
+            Rectification::new(left, right)?;
+        let pinhole = PinholeCamera::from(&camera);
         let map = |source: &CameraConfig, rotation: &Rotation3<f64>| {
             let at = |row: usize, column: usize| {
                 let pixel = Point2::new(column as f64, row as f64);
@@ -113,10 +141,10 @@ impl StereoRig {
         };
         Ok(Self {
             size,
-            camera,
-            baseline,
             left: map(left, &left_from_rectified),
             right: map(right, &right_from_rectified),
+            camera,
+            baseline,
         })
     }
 
@@ -429,10 +457,12 @@ mod tests {
     }
 
     #[test]
-    fn cameras_without_a_baseline_or_in_the_wrong_order_are_refused() {
+    fn cameras_that_do_not_go_together_are_refused() {
         let (left, right, _) = rig();
         assert_eq!(StereoRig::new(&right, &left, (200, 150)).unwrap_err(), StereoError::Order);
         let error = StereoRig::new(&left, &left, (200, 150)).unwrap_err();
         assert!(matches!(error, StereoError::Baseline(_)));
+        let error = StereoRig::new(&left, &right, (usize::MAX, 150)).unwrap_err();
+        assert_eq!(error, StereoError::Size(usize::MAX, 150));
     }
 }

@@ -113,7 +113,10 @@ fn streams(findings: &mut Findings, inspection: &Inspection) {
     for (role, what) in [("color", "color images"), ("depth", "depth images")] {
         let count = |role| inspection.topic(role).map_or(0, |topic| topic.messages);
         let from_stereo = role == "depth" && count("right") > 0;
-        if count(role) == 0 && !from_stereo {
+        if from_stereo && inspection.summary.camera.is_none() {
+            let text = "depth has to come from two cameras: set `log.stereo`".to_owned();
+            findings.add(Severity::Error, role, text);
+        } else if count(role) == 0 && !from_stereo {
             findings.add(Severity::Error, role, format!("no {what}"));
         }
     }

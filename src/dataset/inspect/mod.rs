@@ -150,7 +150,10 @@ impl Inspector {
     ) -> Result<LogSummary, LogError> {
         let survey = Survey::new(log.messages().as_mut());
         let chosen = survey.choose(config).map_err(|role| survey.missing(path, role))?;
-        let summary = survey.summary_of(log.kind(), &chosen);
+        if !config.stereo.is_empty() {
+            self.stereo = survey.rig(path, &chosen, config)?;
+        }
+        let summary = survey.summary_of(log.kind(), &chosen, self.stereo.as_ref());
         self.roles = chosen.into_iter().map(|(role, topic)| (topic, role)).collect();
         let mut messages = log.messages();
         // Topics without messages are told too.
@@ -336,4 +339,59 @@ fn header_stamp(message: &Message) -> Option<Stamp> {
         return None;
     }
     Fields::new(message.data, serialization).ok()?.header().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::samples;
+    use super::*;
+
+    fn inspected(bytes: &[u8]) -> Inspection {
+        let folder = tempfile::tempdir().unwrap();
+        let path = samples::file(&folder, "log", bytes);
+        let (log, imu) = (LogConfig::default(), ImuConfig::default());
+        inspect(&path, &Assumed { log: &log, imu: &imu, body_from_camera: None }).unwrap()
+    }
+
+    #[test]
+    fn every_container_gets_the_same_verdict() {
+        let ros1 = samples::recording(false);
+        let zstd = mcap::WriteOptions::new().compression(Some(mcap::Compression::Zstd));
+        let first = inspected(&samples::bag(&ros1, "none", 8, true).0);
+        assert!(first.verdict.fit, "{:?}", first.findings);
+        let unit = first.imu.as_ref().unwrap().accelerometer_unit;
+        assert_eq!(unit, AccelerometerUnit::StandardGravities);
+        assert_eq!((first.pairs.frames, first.topics.len()), (5, 4));
+        for (kind, bytes) in [
+            ("ROS 1 bag", samples::bag(&ros1, "none", 8, false).0),
+            ("ROS 1 bag", samples::bag(&ros1, "bz2", 8, true).0),
+            ("ROS 1 bag", samples::bag(&ros1, "lz4", 8, true).0),
+            ("MCAP", samples::mcap(&ros1, "ros1", zstd.clone())),
+            ("MCAP", samples::mcap(&samples::recording(true), "cdr", zstd)),
+        ] {
+            let other = inspected(&bytes);
+            assert_eq!(other.summary.kind, kind);
+            let about_streams = |inspection: &Inspection| -> Vec<Finding> {
+                // Log times, and with them the clocks, differ between the two sample formats.
+                let findings = inspection.findings.iter();
+                findings.filter(|f| !f.message.contains("clocks")).cloned().collect()
+            };
+            assert_eq!(about_streams(&other), about_streams(&first), "{kind}");
+            assert_eq!(other.verdict, first.verdict);
+        }
+    }
+
+    #[test]
+    fn disorder_and_repetition_are_told() {
+        let mut samples = samples::recording(false);
+        let imu: Vec<usize> =
+            (0..samples.len()).filter(|k| samples[*k].topic == samples::IMU).collect();
+        samples.swap(imu[20], imu[21]);
+        samples[imu[31]] = samples[imu[30]].clone();
+        let found = inspected(&samples::bag(&samples, "none", 8, true).0);
+        for part in ["1 messages out of order, by up to 0.010 s", "1 messages with the stamp of"] {
+            let about = |f: &&Finding| f.subject == "imu" && f.message.contains(part);
+            assert_eq!(found.findings.iter().filter(about).count(), 1, "{:?}", found.findings);
+        }
+    }
 }
