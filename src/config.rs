@@ -115,11 +115,9 @@ impl Config {
         log: &LogSummary,
         origin: &str,
     ) -> Result<Option<CameraConfig>, ConfigError> {
-        let [left, right] = &self.log.stereo[..] else { return Ok(None) };
         let is_named = !["", "none"].contains(&self.log.right_topic.as_str());
-        if !is_named && !(log.is_stereo() && self.log.depth_topic.is_empty()) {
-            return Ok(None);
-        }
+        let is_stereo = is_named || log.is_stereo() && self.log.depth_topic.is_empty();
+        let ([left, right], true) = (&self.log.stereo[..], is_stereo) else { return Ok(None) };
         rectified_camera(left, right).map(Some).map_err(|error| ConfigError::BadValue {
             origin: origin.to_owned(),
             key: "log.stereo".to_owned(),
