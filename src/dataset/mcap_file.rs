@@ -1,12 +1,12 @@
 //! MCAP files. Format: <https://mcap.dev/spec>.
 //!
-//! The readers of the crate `mcap` want the whole file mapped or overflow on damaged lengths; of
-//! it, only the records are used here.
+//! The readers of the crate `mcap` want the whole file mapped, overflow on damaged lengths or
+//! reserve as much memory as these claim; of it, only names of records are used here.
 
 use std::collections::BTreeMap;
 use std::io::{self, BufRead, Read};
 
-use mcap::records::{Record, op};
+use mcap::records::op;
 
 use super::message::{MessageType, Serialization};
 use super::records::{ChunkHead, Format, MessageHead, RecordHead, RecordKind, Records};
@@ -91,33 +91,37 @@ impl Format for McapFormat {
         })
     }
 
-    fn declare(&mut self, body: &[u8]) -> io::Result<()> {
-        match mcap::parse_record(self.opcode, body).map_err(io::Error::other)? {
-            Record::Schema { header, data } => {
-                let definition = String::from_utf8_lossy(&data).into_owned();
-                self.schemas.entry(header.id).or_insert((header.name, definition));
-            }
-            Record::Channel(channel) => {
-                let schema = self.schemas.get(&channel.schema_id).cloned();
-                let (schema, definition) = schema.unwrap_or_default();
-                let serialization = match channel.message_encoding.as_str() {
-                    "ros1" => Some(Serialization::Ros1),
-                    "cdr" => Some(Serialization::Cdr),
-                    _ => None,
-                };
-                let kind = MessageType::from_name(&schema);
-                let topic = channel.topic;
-                self.channels.entry(channel.id.into()).or_insert(Channel {
-                    topic,
-                    schema,
-                    definition,
-                    kind,
-                    serialization,
-                    metadata: channel.metadata,
-                });
-            }
-            _ => {}
+    fn declare(&mut self, mut body: &[u8]) -> io::Result<()> {
+        let body = &mut body;
+        let id = u16::from_le_bytes(read_array(body)?);
+        if self.opcode == op::SCHEMA {
+            let (name, _encoding) = (text(body)?, text(body)?);
+            let definition = String::from_utf8_lossy(sized(body)?).into_owned();
+            self.schemas.entry(id).or_insert((name, definition));
+            return Ok(());
         }
+        let schema = self.schemas.get(&u16::from_le_bytes(read_array(body)?)).cloned();
+        let (schema, definition) = schema.unwrap_or_default();
+        let (topic, encoding) = (text(body)?, text(body)?);
+        let serialization = match encoding.as_str() {
+            "ros1" => Some(Serialization::Ros1),
+            "cdr" => Some(Serialization::Cdr),
+            _ => None,
+        };
+        let mut notes = sized(body)?;
+        let mut metadata = BTreeMap::new();
+        while !notes.is_empty() {
+            metadata.insert(text(&mut notes)?, text(&mut notes)?);
+        }
+        let kind = MessageType::from_name(&schema);
+        self.channels.entry(id.into()).or_insert(Channel {
+            topic,
+            schema,
+            definition,
+            kind,
+            serialization,
+            metadata,
+        });
         Ok(())
     }
 
@@ -152,5 +156,47 @@ impl Format for McapFormat {
 
     fn channels(&self) -> &BTreeMap<u32, Channel> {
         &self.channels
+    }
+}
+
+/// A sequence of bytes after its length.
+fn sized<'a>(body: &mut &'a [u8]) -> io::Result<&'a [u8]> {
+    let length = u32::from_le_bytes(read_array(body)?);
+    body.split_off(..length as usize)
+        .ok_or_else(|| invalid(format!("{length} bytes in a record that has {}", body.len())))
+}
+
+fn text(body: &mut &[u8]) -> io::Result<String> {
+    std::str::from_utf8(sized(body)?).map(str::to_owned).map_err(io::Error::other)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn declared(opcode: u8, body: &[u8]) -> Result<McapFormat, String> {
+        let mut format = McapFormat { opcode, ..McapFormat::default() };
+        format.declare(body).map(|()| format).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn channels_are_declared_with_their_notes() {
+        let body = b"\x07\0\0\0\x02\0\0\0/a\x03\0\0\0cdr\x0a\0\0\0\x01\0\0\0k\x01\0\0\0v";
+        let format = declared(op::CHANNEL, body).unwrap();
+        let channel = &format.channels[&7];
+        assert_eq!(
+            (channel.topic.as_str(), channel.serialization),
+            ("/a", Some(Serialization::Cdr))
+        );
+        assert_eq!(channel.metadata, BTreeMap::from([("k".to_owned(), "v".to_owned())]));
+    }
+
+    /// A fuzzer found a length for which the crate `mcap` reserved 4 GB.
+    #[test]
+    fn lengths_beyond_the_record_take_no_memory() {
+        let error = declared(op::SCHEMA, b"\x01\0\xfe\xff\xff\xffsensor_msgs/Image").err();
+        assert_eq!(error.unwrap(), "4294967294 bytes in a record that has 17");
+        let cut = declared(op::CHANNEL, b"\x07\0\0\0\x02\0\0\0/a\x03\0\0\0cdr\xff\0\0\0k").err();
+        assert_eq!(cut.unwrap(), "255 bytes in a record that has 1");
     }
 }
