@@ -244,7 +244,7 @@ impl Renderer {
     }
 
     /// The four samples next to one; at the border, the sample itself.
-    #[inline]
+    #[inline(always)]
     fn neighbours<'a>(
         &self,
         samples: &'a [Sample],

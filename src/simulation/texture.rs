@@ -50,35 +50,41 @@ impl Level {
     /// Bilinear value at texel coordinates (0 is the centre of the first texel), in steps of
     /// 1/256 of a texel. Integers, two channels to a word: this is where rendering spends its
     /// time.
-    #[inline]
+    #[inline(always)]
     fn bilinear(&self, x: f32, y: f32) -> [f32; 3] {
-        const PAIR: u32 = 0x00ff_00ff;
         let (x, y) = ((x * 256.0) as i32, (y * 256.0) as i32);
         let (fx, fy) = ((x & 255) as u32, (y & 255) as u32);
         let (column, row) = (x >> 8, y >> 8);
         let index = |i: i32, len: usize| i.clamp(0, len as i32 - 1) as usize;
         let (x0, x1) = (index(column, self.width), index(column + 1, self.width));
         let (y0, y1) = (index(row, self.height), index(row + 1, self.height));
-        let line = |y: usize| {
-            let texel = |x: usize| u32::from_le_bytes(self.texels[y * self.width + x]);
-            let (a, b) = (texel(x0), texel(x1));
-            let pair = |a: u32, b: u32| (a & PAIR) * (256 - fx) + (b & PAIR) * fx;
-            (pair(a, b), pair(a >> 8, b >> 8))
-        };
-        let ((rb0, g0), (rb1, g1)) = (line(y0), line(y1));
+        let (upper, lower) = (&self.texels[y0 * self.width..], &self.texels[y1 * self.width..]);
+        let ((rb0, g0), (rb1, g1)) = (line(upper, (x0, x1), fx), line(lower, (x0, x1), fx));
         let mix = |a: u32, b: u32| ((a & 0xffff) * (256 - fy) + (b & 0xffff) * fy) as f32;
         [mix(rb0, rb1), mix(g0, g1), mix(rb0 >> 16, rb1 >> 16)].map(|c| c / 65536.0)
     }
 }
 
-/// The finer of the two levels next to a footprint of `ratio` texels, and the weight of the coarser.
-#[inline]
-fn mip(ratio: f32) -> (usize, f32) {
+/// Between two texels of a row: red and blue, then green, in the halves of a word and weighted by
+/// 256. Inlined by force, as what follows: calls would cost more than the arithmetic.
+#[inline(always)]
+fn line(row: &[[u8; 4]], (x0, x1): (usize, usize), fx: u32) -> (u32, u32) {
+    const PAIR: u32 = 0x00ff_00ff;
+    let (a, b) = (u32::from_le_bytes(row[x0]), u32::from_le_bytes(row[x1]));
+    let pair = |a: u32, b: u32| (a & PAIR) * (256 - fx) + (b & PAIR) * fx;
+    (pair(a, b), pair(a >> 8, b >> 8))
+}
+
+/// The level for a footprint of `ratio` texels, and the weight of the next coarser one.
+#[inline(always)]
+fn mip(ratio: f32, coarsest: usize) -> (usize, f32) {
     // Exponent and mantissa of the ratio are a good enough logarithm.
     let bits = ratio.max(1.0).to_bits();
+    let fine = (bits >> 23) as usize - 127;
     // Blending only halfway between levels saves half of the second look-ups unseen.
     let blend = (2.0 * (bits & 0x7f_ffff) as f32 / 8_388_608.0 - 0.5).clamp(0.0, 1.0);
-    ((bits >> 23) as usize - 127, blend)
+    let level = if blend == 1.0 { fine + 1 } else { fine };
+    if level >= coarsest { (coarsest, 0.0) } else { (level, blend % 1.0) }
 }
 
 impl Texture {
@@ -92,10 +98,7 @@ impl Texture {
         let (long, axis, short) = if lx > ly { (lx, dx, ly) } else { (ly, dy, lx) };
         let width = short.max(long / MAX_RATIO).max(1e-6);
         // Bilinear kernels overlap: three samples cover a footprint four times as long as wide.
-        let samples = (0.75 * long / width + 0.5) as usize;
-        if samples < 2 {
-            return self.trilinear(u, v, width);
-        }
+        let samples = ((0.75 * long / width + 0.5) as usize).max(1);
         let step = 1.0 / samples as f32;
         let mut sum = [0.0_f32; 3];
         for i in 0..samples {
@@ -107,22 +110,21 @@ impl Texture {
     }
 
     /// Value for a square footprint of `width` m, between the two nearest levels.
-    #[inline]
+    #[inline(always)]
     fn trilinear(&self, u: f32, v: f32, width: f32) -> Color {
-        let (fine, blend) = mip(width / self.texel);
-        let coarsest = self.levels.len() - 1;
-        let at = |level: usize| {
-            let scale = 1.0 / (self.texel * (1_u32 << level) as f32);
-            self.levels[level].bilinear(u * scale - 0.5, v * scale - 0.5)
-        };
-        if fine >= coarsest || blend == 0.0 {
-            return at(fine.min(coarsest));
+        let (level, blend) = mip(width / self.texel, self.levels.len() - 1);
+        let a = self.bilinear(level, u, v);
+        if blend == 0.0 {
+            return a;
         }
-        if blend == 1.0 {
-            return at(fine + 1);
-        }
-        let (a, b) = (at(fine), at(fine + 1));
+        let b = self.bilinear(level + 1, u, v);
         std::array::from_fn(|k| a[k] + (b[k] - a[k]) * blend)
+    }
+
+    #[inline(always)]
+    fn bilinear(&self, level: usize, u: f32, v: f32) -> Color {
+        let scale = 1.0 / (self.texel * (1_u32 << level) as f32);
+        self.levels[level].bilinear(u * scale - 0.5, v * scale - 0.5)
     }
 }
 
@@ -186,21 +188,16 @@ impl Grain {
     /// coordinates in m.
     #[inline]
     pub fn factor(&self, u: f32, v: f32, width: f32) -> f32 {
-        let (fine, blend) = mip(width / Self::TEXEL);
-        let coarsest = self.levels.len() - 1;
-        let grey = if fine >= coarsest || blend == 0.0 {
-            self.bilinear(fine.min(coarsest), u, v)
-        } else if blend == 1.0 {
-            self.bilinear(fine + 1, u, v)
-        } else {
-            let (a, b) = (self.bilinear(fine, u, v), self.bilinear(fine + 1, u, v));
-            a + (b - a) * blend
-        };
+        let (level, blend) = mip(width / Self::TEXEL, self.levels.len() - 1);
+        let mut grey = self.bilinear(level, u, v);
+        if blend > 0.0 {
+            grey += (self.bilinear(level + 1, u, v) - grey) * blend;
+        }
         grey / 128.0
     }
 
     /// As [`Level::bilinear`], but grey and wrapping around.
-    #[inline]
+    #[inline(always)]
     fn bilinear(&self, level: usize, u: f32, v: f32) -> f32 {
         let (texels, side) = (&self.levels[level], Self::SIDE >> level);
         let scale = 256.0 / (Self::TEXEL * (1_u32 << level) as f32);

@@ -177,12 +177,11 @@ impl Solid {
         // The footprint of a pixel on the face: its edges, carried along the face's plane.
         let along = direction[axis];
         let along = if along.abs() < 1e-6 { 1e-6_f32.copysign(along) } else { along };
-        let edge = |column: usize, size: f32| {
-            let e = view.axes.column(column) * (size * hit.distance);
+        let [dx, dy] = [0, 1].map(|side| {
+            let e = view.axes.column(side) * (SPOT * pixel[side] * hit.distance);
             let slide = e[axis] / along;
             [e[u] - direction[u] * slide, e[v] - direction[v] * slide]
-        };
-        let (dx, dy) = (edge(0, SPOT * pixel[0]), edge(1, SPOT * pixel[1]));
+        });
         let (s, t) = (point[u] + self.half[u], point[v] + self.half[v]);
         let face = &self.faces[hit.face];
         let base = face.texture.sample(s, t, dx, dy);
@@ -300,7 +299,7 @@ impl World {
                     rng.set_stream((6 * index + face) as u64 + 1);
                     finished_face((plan, face), room, pictures, (&bare, &lamps), &mut rng)
                 };
-                Solid { faces: (0..6).map(face).collect(), ..plan.solid() }
+                Solid { faces: (0..6).into_par_iter().map(face).collect(), ..plan.solid() }
             })
             .collect();
         Self { solids, grain, rounds }
