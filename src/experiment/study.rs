@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use nalgebra::{Matrix3, Vector3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -200,6 +201,11 @@ fn row(trials: &[Trial], index: usize, paper: &[PaperValue]) -> Row {
             .is_some()
             .then(|| mean_and_deviation(times.map(|time| time.nanoseconds)).0),
     }
+}
+
+/// NEES of a 3-vector; infinite if the covariance is not positive definite.
+pub(super) fn normalized_square(error: &Vector3<f64>, covariance: &Matrix3<f64>) -> f64 {
+    covariance.cholesky().map_or(f64::INFINITY, |factor| error.dot(&factor.solve(error)))
 }
 
 fn mean_and_deviation(values: impl Iterator<Item = f64>) -> (f64, f64) {

@@ -108,6 +108,8 @@
 //!   orders the exponents `z1 >= z3 >= z2`, theorem 2.2 `z1 >= z2 >= z3`.
 //! - W22 (3.9), (3.10) drop a term that is of the order of the correlation; see
 //!   [`attitude_given`](super::matrix_fisher_gaussian::MatrixFisherGaussian::attitude_given).
+//! - W22 (5.40): `gamma` has the length of the measured `r'_i`, not of `r_i`; see
+//!   [`align_progressively`](crate::alignment::align_progressively).
 //! - W22 theorem A.1 leaves its integer open; it is `a(n) = (2n)! binomial(1/2, n)`.
 #![doc = include_str!("../../../docs/math.html")]
 
