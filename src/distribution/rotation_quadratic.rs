@@ -91,6 +91,16 @@ impl RotationMoments {
     pub fn mean_rotation(&self) -> Matrix3<f64> {
         matrix(&self.mean)
     }
+
+    /// Nine matrices `D_k` with `Cov[r] = sum vec(D_k) vec(D_k)^T`: the average of what is
+    /// quadratic in `R` is its value at `E[R]` plus that of its quadratic part at each of them.
+    pub fn deviations(&self) -> [Matrix3<f64>; 9] {
+        let eigen = SymmetricEigen::new(self.covariance);
+        std::array::from_fn(|k| {
+            let root = eigen.eigenvalues[k].max(0.0).sqrt();
+            matrix(&(eigen.eigenvectors.column(k) * root))
+        })
+    }
 }
 
 impl RotationQuadratic {
