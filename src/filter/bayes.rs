@@ -8,6 +8,7 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use crate::distribution::matrix_fisher::{MatrixFisher, MatrixFisherError};
 use crate::distribution::matrix_fisher_gaussian::MfgError;
+use crate::distribution::progressive::ProgressiveError;
 use crate::distribution::unscented::UnscentedError;
 use crate::so3::NotFinite;
 
@@ -300,6 +301,8 @@ pub enum FilterError {
     Belief(#[from] MfgError),
     #[error(transparent)]
     SigmaPoints(#[from] UnscentedError),
+    #[error(transparent)]
+    Progressive(#[from] ProgressiveError),
     #[error(transparent)]
     Matrix(#[from] NotFinite),
 }

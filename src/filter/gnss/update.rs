@@ -21,7 +21,7 @@ use super::belief::{
 use super::central::{CentralMoments, Matrix9, Vector9, mean_and_covariance};
 use crate::alignment::{rotated_vector_by_rotation, vectorize};
 use crate::distribution::matrix_fisher::MatrixFisher;
-use crate::distribution::unscented::{bingham_points, mean_rotation};
+use crate::distribution::progressive::{ProgressiveConfig, progressive_update};
 use crate::filter::{FilterError, PositionMeasurement};
 
 /// How the attitude's posterior is brought to a matrix Fisher density.
@@ -49,7 +49,8 @@ const MAX_FLOW_STEPS: usize = 2000;
 /// Smallest ratio of the likelihoods of two sigma points in one step (`tau` of W22 table 5.2; the
 /// paper gives no value).
 const SIGMA_POINT_RATIO: f64 = 0.05;
-/// Weight of the central sigma point.
+/// Share of its weight that the central sigma point keeps: three quarters of the likelihood's
+/// information are added, see [`progressive_update`].
 const CENTRAL_SHARE: f64 = 1.0 / 3.0;
 const MAX_SIGMA_POINT_STEPS: usize = 10_000;
 const MAX_NEWTON_STEPS: usize = 50;
@@ -294,31 +295,14 @@ impl AttitudeLikelihood {
         (gradient, gauss_newton + bending(&slope), gauss_newton + bending(f))
     }
 
-    /// W22 table 5.2, with the sigma points that need only `E[R]`.
+    /// W22 table 5.2.
     fn sigma_points(&self, prior: &MatrixFisher) -> Result<MatrixFisher, FilterError> {
-        let mut mean = prior.mean();
-        let mut left = 1.0;
-        for _ in 0..MAX_SIGMA_POINT_STEPS {
-            let mut points = bingham_points(&mean, CENTRAL_SHARE)?;
-            let logs = points.map(|p| self.log(p.attitude.matrix()));
-            let largest = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-            let smallest = logs.iter().copied().fold(f64::INFINITY, f64::min);
-            let spread = largest - smallest;
-            let part = if spread * left > -SIGMA_POINT_RATIO.ln() {
-                -SIGMA_POINT_RATIO.ln() / spread
-            } else {
-                left
-            };
-            for (point, log) in points.iter_mut().zip(logs) {
-                point.weight *= (part * (log - largest)).exp();
-            }
-            mean = mean_rotation(&points);
-            left -= part;
-            if left <= 0.0 {
-                return Ok(MatrixFisher::from_mean(&mean)?);
-            }
-        }
-        Err(FilterError::NoConvergence("sigma point update"))
+        let config = ProgressiveConfig {
+            least_ratio: SIGMA_POINT_RATIO,
+            central_share: CENTRAL_SHARE,
+            max_steps: MAX_SIGMA_POINT_STEPS,
+        };
+        Ok(progressive_update(prior, |rotation| self.log(rotation.matrix()), &config)?)
     }
 }
 
