@@ -16,13 +16,14 @@ use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+use super::study::normalized_square;
 use super::{
     Observation, PaperValue, Report, Request, StepTime, Study, StudyError, Trial, monte_carlo,
 };
 use crate::alignment::PointPair;
 use crate::distribution::matrix_fisher::{MatrixFisher, MatrixFisherError};
 use crate::filter::{
-    FilterConfig, FilterKind, MapEstimate, MapTreatment, PointState, SeenPoint,
+    FilterConfig, FilterKind, MapEstimate, MapTreatment, PointState, SeenPoint, UpdateMethod,
     VisualInertialFilter,
 };
 use crate::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator, block};
@@ -34,19 +35,25 @@ pub const STUDIES: &[Study] = &[
         name: "wang-5.11",
         title: "visual-inertial navigation, map known",
         runs: 100,
-        run: |request| study("wang-5.11", KNOWN_MAP, TABLE_5_11, request),
+        run: |request| {
+            study("wang-5.11", KNOWN_MAP, TABLE_5_11.as_flattened().as_flattened(), request)
+        },
     },
     Study {
         name: "wang-5.15",
         title: "visual-inertial navigation, map uncertain",
         runs: 100,
-        run: |request| study("wang-5.15", UNCERTAIN_MAP, TABLE_5_15, request),
+        run: |request| {
+            study("wang-5.15", UNCERTAIN_MAP, TABLE_5_15.as_flattened().as_flattened(), request)
+        },
     },
     Study {
         name: "wang-5.16",
         title: "visual-inertial odometry, map uncertain in the first second and unknown after it",
         runs: 100,
-        run: |request| study("wang-5.16", UNKNOWN_MAP, TABLE_5_16, request),
+        run: |request| {
+            study("wang-5.16", UNKNOWN_MAP, TABLE_5_16.as_flattened().as_flattened(), request)
+        },
     },
 ];
 
@@ -76,10 +83,18 @@ struct Case {
     heading: Heading,
 }
 
+/// A filter and the name of its rows.
+#[derive(Debug, Clone, Copy)]
+struct Contender {
+    name: &'static str,
+    kind: FilterKind,
+    update_method: UpdateMethod,
+}
+
 struct Drives {
     landmarks: usize,
     measurement_sd: f64,
-    filters: &'static [FilterKind],
+    filters: &'static [&'static [Contender]],
     cases: &'static [Case],
 }
 
@@ -87,10 +102,34 @@ const fn case(label: &'static str, prior: MapPrior, heading: Heading) -> Case {
     Case { label, prior, heading }
 }
 
+const fn contender(name: &'static str, kind: FilterKind, update_method: UpdateMethod) -> Contender {
+    Contender { name, kind, update_method }
+}
+
+/// With a fixed map; the second is the paper's MFG filter, by sigma points.
+const FIXED: &[Contender] = &[
+    contender("mfgd", FilterKind::Mfgd, UpdateMethod::Exact),
+    contender("mfgd-paper", FilterKind::Mfgd, UpdateMethod::SigmaPoints),
+    contender("mekfd", FilterKind::Mekfd, UpdateMethod::Exact),
+];
+
+/// With a map that is refined.
+const REFINED: &[Contender] = &[
+    contender("mfgr", FilterKind::Mfgr, UpdateMethod::Exact),
+    contender("mfgr-paper", FilterKind::Mfgr, UpdateMethod::SigmaPoints),
+    contender("mekfr", FilterKind::Mekfr, UpdateMethod::Exact),
+];
+
+/// With map points in the state.
+const CORRELATED: &[Contender] = &[
+    contender("mfgs", FilterKind::Mfgs, UpdateMethod::Exact),
+    contender("mekfs", FilterKind::Mekfs, UpdateMethod::Exact),
+];
+
 const KNOWN_MAP: &Drives = &Drives {
     landmarks: 100,
     measurement_sd: 1.0,
-    filters: &[FilterKind::Mfgd, FilterKind::Mekfd],
+    filters: &[FIXED],
     cases: &[
         case("small", MapPrior::Exact, Heading::Known),
         case("large-initial", MapPrior::Exact, Heading::Reversed),
@@ -100,7 +139,7 @@ const KNOWN_MAP: &Drives = &Drives {
 const UNCERTAIN_MAP: &Drives = &Drives {
     landmarks: 400,
     measurement_sd: 0.05,
-    filters: &[FilterKind::Mfgr, FilterKind::Mekfr],
+    filters: &[REFINED],
     cases: &[
         case("normal", MapPrior::All(0.1), Heading::Known),
         case("large-map", MapPrior::All(1.0), Heading::Known),
@@ -111,7 +150,7 @@ const UNCERTAIN_MAP: &Drives = &Drives {
 const UNKNOWN_MAP: &Drives = &Drives {
     landmarks: 400,
     measurement_sd: 0.05,
-    filters: &[FilterKind::Mfgr, FilterKind::Mekfr, FilterKind::Mfgs, FilterKind::Mekfs],
+    filters: &[REFINED, CORRELATED],
     cases: &[
         case("normal", MapPrior::FirstSecond(0.1), Heading::Known),
         case("large-map", MapPrior::FirstSecond(1.0), Heading::Known),
@@ -152,23 +191,29 @@ fn trial(drives: &Drives, rng: &mut ChaCha8Rng) -> Result<Trial, MatrixFisherErr
         ..ImuConfig::default()
     });
     let state_points = drives.landmarks.div_ceil(STATE_STRIDE);
-    let filter_config = FilterConfig { huber: 0.0, state_points, ..FilterConfig::default() };
     let mut trial = Trial::default();
     for case in drives.cases {
         let map = prior_map(&scene, case.prior, rng);
         let (belief, attitude) = start(&scene, case.heading, rng)?;
         let broad = attitude.is_some();
-        let can_start =
-            |kind: &FilterKind| !(broad && kind.map_treatment() == MapTreatment::Correlated);
-        for kind in drives.filters.iter().copied().filter(can_start) {
+        let can_start = |contender: &&Contender| {
+            !(broad && contender.kind.map_treatment() == MapTreatment::Correlated)
+        };
+        for contender in drives.filters.iter().copied().flatten().filter(can_start) {
+            let &Contender { kind, update_method, .. } = contender;
+            let config = FilterConfig {
+                update_method,
+                huber: 0.0,
+                gate_probability: 0.0,
+                state_points,
+                ..FilterConfig::default()
+            };
             let mut filter = match &attitude {
-                None => kind.start(&filter_config, propagator.clone(), belief),
-                Some(attitude) => {
-                    kind.start_broad(&filter_config, propagator.clone(), belief, attitude)
-                }
+                None => kind.start(&config, propagator.clone(), belief),
+                Some(attitude) => kind.start_broad(&config, propagator.clone(), belief, attitude),
             };
             let errors = drive(filter.as_mut(), kind.map_treatment(), &scene, map.clone());
-            errors.record(case, kind, &mut trial);
+            errors.record(case, contender, &mut trial);
         }
     }
     Ok(trial)
@@ -404,7 +449,7 @@ impl DriveErrors {
         let (estimate, exact) = (&belief.state.world_from_body, &truth.world_from_body);
         let nees = |error: Vector3<f64>, start: usize| {
             let covariance = belief.covariance.fixed_view::<3, 3>(start, start).into_owned();
-            covariance.cholesky().map_or(f64::INFINITY, |factor| error.dot(&factor.solve(&error)))
+            normalized_square(&error, &covariance)
         };
         let turn = (estimate.rotation.inverse() * exact.rotation).scaled_axis();
         self.nees_attitude.add(nees(turn, block::ROTATION));
@@ -414,7 +459,7 @@ impl DriveErrors {
         self.nees_position.add(nees(position, block::POSITION));
     }
 
-    fn record(&self, case: &Case, kind: FilterKind, trial: &mut Trial) {
+    fn record(&self, case: &Case, contender: &Contender, trial: &mut Trial) {
         let quantities = [
             ("attitude_deg", &self.attitude_deg),
             ("velocity_m_s", &self.velocity),
@@ -424,9 +469,9 @@ impl DriveErrors {
             ("nees_velocity", &self.nees_velocity),
             ("nees_position", &self.nees_position),
         ];
-        let (case, filter) = (case.label, kind.name());
+        let (case, filter) = (case.label, contender.name);
         for (quantity, mean) in quantities {
-            if quantity == "map_m" && kind.map_treatment() == MapTreatment::Fixed {
+            if quantity == "map_m" && contender.kind.map_treatment() == MapTreatment::Fixed {
                 continue;
             }
             let value = mean.value();
@@ -437,82 +482,53 @@ impl DriveErrors {
     }
 }
 
-const fn paper(
+const QUANTITIES: [&str; 4] = ["attitude_deg", "velocity_m_s", "position_m", "map_m"];
+
+/// A column of a table: the first of [`QUANTITIES`].
+const fn column<const N: usize>(
     case: &'static str,
     filter: &'static str,
-    quantity: &'static str,
-    mean: f64,
-) -> PaperValue {
-    PaperValue { case, filter, quantity, mean }
+    means: [f64; N],
+) -> [PaperValue; N] {
+    let mut values = [PaperValue { case, filter, quantity: "", mean: 0.0 }; N];
+    let mut i = 0;
+    while i < N {
+        values[i].quantity = QUANTITIES[i];
+        values[i].mean = means[i];
+        i += 1;
+    }
+    values
 }
 
-const TABLE_5_11: &[PaperValue] = &[
-    paper("small", "mfgd", "attitude_deg", 0.97),
-    paper("small", "mfgd", "velocity_m_s", 0.208),
-    paper("small", "mfgd", "position_m", 0.173),
-    paper("small", "mekfd", "attitude_deg", 0.90),
-    paper("small", "mekfd", "velocity_m_s", 0.205),
-    paper("small", "mekfd", "position_m", 0.172),
-    paper("large-initial", "mfgd", "attitude_deg", 1.62),
-    paper("large-initial", "mfgd", "velocity_m_s", 0.235),
-    paper("large-initial", "mfgd", "position_m", 0.184),
-    paper("large-initial", "mekfd", "attitude_deg", 75.0),
-    paper("large-initial", "mekfd", "velocity_m_s", 1.59),
-    paper("large-initial", "mekfd", "position_m", 2.37),
+/// Columns of all filters: the paper's MFG stands beside both of ours.
+const fn printed<const N: usize>(
+    case: &'static str,
+    filters: &'static [Contender],
+    mfg: [f64; N],
+    mekf: [f64; N],
+) -> [[PaperValue; N]; 3] {
+    [
+        column(case, filters[0].name, mfg),
+        column(case, filters[1].name, mfg),
+        column(case, filters[2].name, mekf),
+    ]
+}
+
+const TABLE_5_11: &[[[PaperValue; 3]; 3]] = &[
+    printed("small", FIXED, [0.97, 0.208, 0.173], [0.90, 0.205, 0.172]),
+    printed("large-initial", FIXED, [1.62, 0.235, 0.184], [75.0, 1.59, 2.37]),
 ];
 
-const TABLE_5_15: &[PaperValue] = &[
-    paper("normal", "mfgr", "attitude_deg", 0.65),
-    paper("normal", "mfgr", "velocity_m_s", 0.078),
-    paper("normal", "mfgr", "position_m", 0.042),
-    paper("normal", "mfgr", "map_m", 0.044),
-    paper("normal", "mekfr", "attitude_deg", 0.73),
-    paper("normal", "mekfr", "velocity_m_s", 0.079),
-    paper("normal", "mekfr", "position_m", 0.048),
-    paper("normal", "mekfr", "map_m", 0.051),
-    paper("large-map", "mfgr", "attitude_deg", 4.36),
-    paper("large-map", "mfgr", "velocity_m_s", 0.158),
-    paper("large-map", "mfgr", "position_m", 0.314),
-    paper("large-map", "mfgr", "map_m", 0.384),
-    paper("large-map", "mekfr", "attitude_deg", 5.12),
-    paper("large-map", "mekfr", "velocity_m_s", 0.179),
-    paper("large-map", "mekfr", "position_m", 0.355),
-    paper("large-map", "mekfr", "map_m", 0.441),
-    paper("large-initial", "mfgr", "attitude_deg", 1.07),
-    paper("large-initial", "mfgr", "velocity_m_s", 0.082),
-    paper("large-initial", "mfgr", "position_m", 0.041),
-    paper("large-initial", "mfgr", "map_m", 0.043),
-    paper("large-initial", "mekfr", "attitude_deg", 101.64),
-    paper("large-initial", "mekfr", "velocity_m_s", 1.610),
-    paper("large-initial", "mekfr", "position_m", 5.033),
-    paper("large-initial", "mekfr", "map_m", 6.167),
+const TABLE_5_15: &[[[PaperValue; 4]; 3]] = &[
+    printed("normal", REFINED, [0.65, 0.078, 0.042, 0.044], [0.73, 0.079, 0.048, 0.051]),
+    printed("large-map", REFINED, [4.36, 0.158, 0.314, 0.384], [5.12, 0.179, 0.355, 0.441]),
+    printed("large-initial", REFINED, [1.07, 0.082, 0.041, 0.043], [101.64, 1.610, 5.033, 6.167]),
 ];
 
-const TABLE_5_16: &[PaperValue] = &[
-    paper("normal", "mfgr", "attitude_deg", 1.16),
-    paper("normal", "mfgr", "velocity_m_s", 0.086),
-    paper("normal", "mfgr", "position_m", 0.103),
-    paper("normal", "mfgr", "map_m", 0.109),
-    paper("normal", "mekfr", "attitude_deg", 1.25),
-    paper("normal", "mekfr", "velocity_m_s", 0.088),
-    paper("normal", "mekfr", "position_m", 0.108),
-    paper("normal", "mekfr", "map_m", 0.115),
-    paper("large-map", "mfgr", "attitude_deg", 4.47),
-    paper("large-map", "mfgr", "velocity_m_s", 0.161),
-    paper("large-map", "mfgr", "position_m", 0.321),
-    paper("large-map", "mfgr", "map_m", 0.393),
-    paper("large-map", "mekfr", "attitude_deg", 5.18),
-    paper("large-map", "mekfr", "velocity_m_s", 0.180),
-    paper("large-map", "mekfr", "position_m", 0.360),
-    paper("large-map", "mekfr", "map_m", 0.448),
-    paper("large-initial", "mfgr", "attitude_deg", 1.56),
-    paper("large-initial", "mfgr", "velocity_m_s", 0.090),
-    paper("large-initial", "mfgr", "position_m", 0.098),
-    paper("large-initial", "mfgr", "map_m", 0.104),
-    paper("large-initial", "mekfr", "attitude_deg", 179.0),
-    paper("large-initial", "mekfr", "velocity_m_s", 2.328),
-    paper("large-initial", "mekfr", "position_m", 9.958),
-    paper("large-initial", "mekfr", "map_m", 11.55),
+const TABLE_5_16: &[[[PaperValue; 4]; 3]] = &[
+    printed("normal", REFINED, [1.16, 0.086, 0.103, 0.109], [1.25, 0.088, 0.108, 0.115]),
+    printed("large-map", REFINED, [4.47, 0.161, 0.321, 0.393], [5.18, 0.180, 0.360, 0.448]),
+    printed("large-initial", REFINED, [1.56, 0.090, 0.098, 0.104], [179.0, 2.328, 9.958, 11.55]),
 ];
 
 #[cfg(test)]
