@@ -54,8 +54,9 @@ Example:
   mfg-vio evaluate rpe ref.txt est.txt --delta 1 --unit m --all-pairs --lengths 1,2";
 
 const NEES_HELP: &str = "\
-DIR is what `replay --out DIR` wrote, or a state.csv. Worlds are aligned at the
-first matched pose unless --align says otherwise; none if they are the same.
+DIR is what `replay --out DIR` wrote, or a state.csv. Worlds are aligned by heading
+and position (where they are not both z-up: wholly) at the first matched pose whose
+attitude is known, unless --align says otherwise; none if they are the same.
 
 Example:
   mfg-vio simulate --out sim.mcap --duration 10 && mfg-vio replay sim.mcap --out run
