@@ -24,10 +24,9 @@ struct StatePoint {
     id: u64,
     /// World coordinates, m.
     position: Vector3<f64>,
-    /// Where it was when it entered, carried along by the corrections of the body's pose. The
-    /// calibration's derivatives are taken there for ever: taken where the point is seen or has
-    /// been estimated since, they would differ from frame to frame by noise, and what does not
-    /// differ between frames would seem to be measured.
+    /// Where it was when it entered. The calibration's derivatives are taken there for ever: taken
+    /// where the point is seen, they would differ by its noise from frame to frame, and what does
+    /// not differ between frames would seem to be measured.
     entered_at: Point3<f64>,
 }
 
@@ -131,17 +130,6 @@ impl SlamFilter {
         self.calibration_rows().end
     }
 
-    /// Lets the calibration drift over an interval, s.
-    fn drift(&mut self, seconds: f64) {
-        if let Some(calibration) = &self.calibration {
-            let variances = calibration.drift(seconds.max(0.0));
-            let row = self.calibration_rows().start;
-            for (k, variance) in variances.into_iter().enumerate() {
-                self.covariance[(row + k, row + k)] += variance;
-            }
-        }
-    }
-
     /// Derivative of a point of the world as measured in the body by the blocks of the
     /// calibration.
     fn by_calibration(&self, point: &Point3<f64>) -> Option<[Matrix3<f64>; CALIBRATION_BLOCKS]> {
@@ -151,11 +139,6 @@ impl SlamFilter {
             angular_velocity: self.measured_rate - state.gyro_bias,
             velocity: state.world_from_body.rotation.inverse() * state.velocity,
         };
-        let sd = |start: usize| {
-            let covariance = self.belief.covariance.fixed_view::<3, 3>(start, start);
-            covariance.trace().max(0.0).sqrt()
-        };
-        let motion = motion.beyond_noise(sd(block::GYRO_BIAS), sd(block::VELOCITY));
         Some(self.calibration.as_ref()?.derivatives(&in_body, &motion))
     }
 
@@ -254,12 +237,10 @@ impl SlamFilter {
         if !(finite && belief.is_finite()) {
             return None;
         }
-        let correction = belief.state.world_from_body * self.belief.state.world_from_body.inverse();
         self.belief = belief;
         let points = means.iter().skip(self.base() / 3 - 1);
         for (point, position) in self.points.iter_mut().zip(points) {
             point.position = *position;
-            point.entered_at = correction * point.entered_at;
         }
         if let (Some(gravity), Some(mean)) = (&mut self.gravity, means.get(NAVIGATION / 3 - 1)) {
             gravity.mean = *mean;
@@ -448,7 +429,6 @@ impl VisualInertialFilter for SlamFilter {
         let step = self.propagator.propagate_with_transition(&mut self.belief, from, to);
         if let Some(step) = step {
             self.measured_rate = to.angular_velocity;
-            self.drift(to.stamp.seconds_since(from.stamp));
             self.transition = step * self.transition;
             if let Some(gravity) = &mut self.gravity {
                 gravity.propagate(&mut self.belief, &step, to.stamp.seconds_since(from.stamp));
