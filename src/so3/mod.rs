@@ -59,6 +59,7 @@
 mod exponential;
 mod haar;
 mod polar;
+mod principal_axes;
 mod proper_svd;
 mod quaternion;
 
@@ -68,6 +69,7 @@ pub use exponential::{
 };
 pub use haar::{HaarQuadrature, sample_haar};
 pub use polar::proper_polar;
+pub use principal_axes::principal_axes;
 pub use proper_svd::{NotFinite, ProperSvd, project_to_so3, proper_svd};
 pub use quaternion::{
     isoclinic_decomposition, left_isoclinic, quaternion_from_rotation, quaternion_product,

@@ -108,7 +108,7 @@ fn jacobi_rotation(a: &Matrix3<f64>, p: usize, q: usize) -> Option<(f64, f64)> {
     (tangent != 0.0).then_some((cosine, cosine * tangent))
 }
 
-fn rotate_columns(m: &mut Matrix3<f64>, p: usize, q: usize, cosine: f64, sine: f64) {
+pub(super) fn rotate_columns(m: &mut Matrix3<f64>, p: usize, q: usize, cosine: f64, sine: f64) {
     for row in 0..3 {
         let (x, y) = (m[(row, p)], m[(row, q)]);
         m[(row, p)] = cosine * x - sine * y;

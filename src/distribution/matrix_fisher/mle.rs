@@ -8,7 +8,8 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::engine::{self, Sums};
+use super::engine::Sums;
+use super::first::FirstMoments;
 
 /// Steps before giving up; at most 9 were ever needed.
 const MAX_STEPS: usize = 40;
@@ -59,7 +60,7 @@ pub fn s_from_d(d: &Vector3<f64>) -> Result<Vector3<f64>, MomentError> {
 /// `S` with `1 - E[Q_ii] = g_i`, for `g1 <= g2 <= min(g3, 2 - g3)`.
 pub fn s_from_complement(g: &Vector3<f64>) -> Result<Vector3<f64>, MomentError> {
     let target = squares_of_complement(g)?;
-    solve(&target, initial_sums(&target))
+    solve(&target, initial(&target))
         .map(|sums| sums.singular_values())
         .map_err(|error| error.with_moments(g.map(|g| 1.0 - g).into()))
 }
@@ -106,7 +107,7 @@ pub fn s_from_quaternion_squares(squares: &Vector3<f64>) -> Result<Vector3<f64>,
     if !target.iter().all(|&m| m > MIN_SQUARE) {
         return Err(MomentError::NotAdmissible(target));
     }
-    solve(&target, initial_sums(&target)).map(|sums| sums.singular_values())
+    solve(&target, initial(&target)).map(|sums| sums.singular_values())
 }
 
 /// [`s_from_complement`] started from a neighbouring solution, as a filter has it from its last
@@ -115,24 +116,32 @@ pub fn s_from_complement_near(
     g: &Vector3<f64>,
     neighbour: &Vector3<f64>,
 ) -> Result<Vector3<f64>, MomentError> {
-    let target = squares_of_complement(g)?;
     let start = Sums::of_singular_values(neighbour).a.map(|a| a.max(0.0));
-    solve(&target, ordered(start))
-        .or_else(|_| solve(&target, initial_sums(&target)))
+    s_from_complement_at(g, FirstMoments::of(Sums::new(ordered(start))))
+}
+
+/// The same where the moments of the neighbour are known.
+pub(super) fn s_from_complement_at(
+    g: &Vector3<f64>,
+    neighbour: FirstMoments,
+) -> Result<Vector3<f64>, MomentError> {
+    let target = squares_of_complement(g)?;
+    solve(&target, neighbour)
+        .or_else(|_| solve(&target, initial(&target)))
         .map(|sums| sums.singular_values())
         .map_err(|error| error.with_moments(g.map(|g| 1.0 - g).into()))
 }
 
 /// A guess that is exact to leading order at the uniform and at the concentrated end of each
 /// degree of freedom; for one degree it is the usual `k = A (2 - A^2)/(1 - A^2)` of the circle.
-fn initial_sums(target: &[f64; 3]) -> [f64; 3] {
+fn initial(target: &[f64; 3]) -> FirstMoments {
     let scalar = 1.0 - target.iter().sum::<f64>();
     let guess = target.map(|m| {
         let contrast = ((scalar - m) / (scalar + m)).max(0.0);
         let spread = (1.0 - contrast * contrast).powi(2);
         (scalar - m).max(0.0) / (4.0 * m * scalar) * (1.0 + 2.0 * scalar * spread)
     });
-    ordered(guess)
+    FirstMoments::of(Sums::new(ordered(guess)))
 }
 
 /// Raises entries to their predecessors.
@@ -141,16 +150,17 @@ fn ordered([a1, a2, a3]: [f64; 3]) -> [f64; 3] {
     [a1, a2, a3.max(a2)]
 }
 
-fn solve(target: &[f64; 3], start: [f64; 3]) -> Result<Sums, MomentError> {
-    let mut sums = Sums::new(start);
+fn solve(target: &[f64; 3], start: FirstMoments) -> Result<Sums, MomentError> {
+    let mut at = start;
     let mut size = f64::INFINITY;
     for _ in 0..MAX_STEPS {
-        let Some(step) = newton_step(target, &sums) else { break };
+        let Some(step) = newton_step(target, &at) else { break };
         size = step.amax;
-        sums = Sums::new(ordered(std::array::from_fn(|i| limited_step(sums.a[i], step.da[i]))));
+        let next = ordered(std::array::from_fn(|i| limited_step(at.sums.a[i], step.da[i])));
         if size < SMALL_STEP {
-            return Ok(sums);
+            return Ok(Sums::new(next));
         }
+        at = FirstMoments::of(Sums::new(next));
     }
     Err(MomentError::NotConverged { moments: *target, step: size })
 }
@@ -167,10 +177,9 @@ struct Step {
     amax: f64,
 }
 
-fn newton_step(target: &[f64; 3], sums: &Sums) -> Option<Step> {
-    let pass = engine::pass::<false>(sums);
-    let m = pass.squares;
-    let correlation = Matrix3::from_fn(|i, j| pass.products[i][j] / (m[i] * m[j]) - 1.0);
+fn newton_step(target: &[f64; 3], at: &FirstMoments) -> Option<Step> {
+    let m = at.squares;
+    let correlation = Matrix3::from_fn(|i, j| at.products[i][j] / (m[i] * m[j]) - 1.0);
     let residual = Vector3::from_fn(|i, _| 0.5 * (m[i] / target[i] - 1.0));
     let eta = correlation.cholesky()?.solve(&residual);
     Some(Step { da: std::array::from_fn(|i| eta[i] / m[i]), amax: eta.amax() })

@@ -128,16 +128,16 @@ mod recursion;
 mod sampler;
 mod subset;
 
-use nalgebra::{Matrix3, Rotation3, SMatrix, SymmetricEigen, Vector3};
+use nalgebra::{Matrix3, Rotation3, SMatrix, Vector3};
 use rand::Rng;
 use rand_distr::Distribution;
 
-use crate::so3::{NotFinite, ProperSvd, proper_svd, quaternion_from_rotation};
+use crate::so3::{NotFinite, ProperSvd, principal_axes, proper_svd, quaternion_from_rotation};
 use engine::Sums;
 
 pub use approximation::{ApproximateMoments, s_concentrated, s_near_uniform};
 pub use axes::canonical_axes;
-pub use first::first_complement;
+pub use first::FirstMoments;
 pub use mle::{
     MomentError, s_from_complement, s_from_complement_near, s_from_d, s_from_quaternion_squares,
 };
@@ -233,7 +233,8 @@ impl MatrixFisher {
             return Err(NotFinite(information).into());
         }
         let symmetric = 0.5 * (information + information.transpose());
-        let (axes, h) = ascending_eigenvectors(&symmetric);
+        let (axes, negated) = principal_axes(&-symmetric);
+        let h = -negated;
         if h[0] < -NEGATIVE_INFORMATION * h[2] || h[2] < 0.0 {
             return Err(MatrixFisherError::NegativeInformation(h[0]));
         }
@@ -332,16 +333,6 @@ impl MatrixFisher {
         let v = self.svd.v;
         ProperSvd { u: v, s: Vector3::from(*diagonal), v }.matrix()
     }
-}
-
-/// Eigenvectors as a rotation, eigenvalues ascending.
-fn ascending_eigenvectors(symmetric: &Matrix3<f64>) -> (Rotation3<f64>, [f64; 3]) {
-    let eigen = SymmetricEigen::new(*symmetric);
-    let mut order = [0, 1, 2];
-    order.sort_by(|&i, &j| eigen.eigenvalues[i].total_cmp(&eigen.eigenvalues[j]));
-    let [x, y] = [order[0], order[1]].map(|i| eigen.eigenvectors.column(i).into_owned());
-    let axes = Matrix3::from_columns(&[x, y, x.cross(&y)]);
-    (Rotation3::from_matrix_unchecked(axes), order.map(|i| eigen.eigenvalues[i]))
 }
 
 /// `s2 + s3, s1 + s3, s1 + s2`: the concentrations about the principal axes.

@@ -7,13 +7,12 @@ use super::super::bayes::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorMeasurement,
 };
 use super::GyroModel;
-use super::mean::PolarMean;
+use super::mean::PrincipalMean;
 use crate::distribution::matrix_fisher::{
-    MatrixFisher, MatrixFisherError, first_complement, s_concentrated, s_from_complement_near,
-    s_near_uniform,
+    FirstMoments, MatrixFisher, MatrixFisherError, s_concentrated, s_near_uniform,
 };
 use crate::distribution::unscented::{matrix_fisher_of_seven, mean_rotation, seven_points};
-use crate::so3::{ProperSvd, exp, proper_svd};
+use crate::so3::{ProperSvd, exp, principal_axes, proper_polar};
 
 /// Spread of the seven sigma points, `sigma` of L-UAE.
 const SEVEN_POINT_SPREAD: f64 = 0.9;
@@ -40,28 +39,9 @@ pub enum MomentMap {
 pub struct BayesFisher {
     map: MomentMap,
     gyro: GyroModel,
-    mean: PolarMean,
-    /// The parameter at the last measurement, where the next inversion starts.
-    last: Concentrations,
-}
-
-/// Singular values with the complements `1 - E[Q_ii]` that belong to them.
-#[derive(Debug, Clone, Copy)]
-struct Concentrations {
-    s: Vector3<f64>,
-    g: Vector3<f64>,
-}
-
-impl Concentrations {
-    /// The singular values for the complements `g`, to leading order: the sums `s_j + s_k` are
-    /// close to inversely proportional to the mean squares of the quaternion.
-    fn predicted(&self, g: &Vector3<f64>) -> Vector3<f64> {
-        let opposite = |v: &Vector3<f64>| v.map(|x| v.sum() - 2.0 * x);
-        let sums = self.s.map(|s| self.s.sum() - s);
-        let sums = sums.component_mul(&opposite(&self.g)).component_div(&opposite(g));
-        let s = 0.5 * opposite(&sums);
-        if s.iter().all(|s| s.is_finite()) { s } else { self.s }
-    }
+    mean: PrincipalMean,
+    /// Those of the posterior of the last measurement, where the next inversion starts.
+    last: FirstMoments,
 }
 
 impl BayesFisher {
@@ -84,18 +64,19 @@ impl BayesFisher {
     /// `F + added`.
     fn fuse(&mut self, added: &Matrix3<f64>) -> Result<(), FilterError> {
         let prior = self.map.parameter(&self.mean, &self.last)?;
-        let posterior = proper_svd(&(prior.matrix() + added))?;
+        let (mode, k) = proper_polar(&(prior.matrix() + added))?;
+        let (v, s) = principal_axes(&k);
+        let posterior = ProperSvd { u: mode * v, s: in_order(&s), v };
         (self.mean, self.last) = self.map.mean(&posterior)?;
         Ok(())
     }
 }
 
 impl MomentMap {
-    fn mean(self, fisher: &ProperSvd) -> Result<(PolarMean, Concentrations), FilterError> {
+    fn mean(self, fisher: &ProperSvd) -> Result<(PrincipalMean, FirstMoments), FilterError> {
+        let first = FirstMoments::new(&fisher.s).map_err(MatrixFisherError::from)?;
         let g = match self {
-            Self::Exact | Self::Approximate => {
-                first_complement(&fisher.s).map_err(MatrixFisherError::from)?
-            }
+            Self::Exact | Self::Approximate => first.complement(),
             Self::SevenPoints => {
                 let fisher = MatrixFisher::from_svd(*fisher).map_err(MatrixFisherError::from)?;
                 let mean = mean_rotation(&seven_points(&fisher, SEVEN_POINT_SPREAD)?);
@@ -104,15 +85,18 @@ impl MomentMap {
                 centred.diagonal().map(|d| 1.0 - d)
             }
         };
-        let mean = PolarMean::from_principal(&fisher.u, &g, &fisher.v);
-        Ok((mean, Concentrations { s: fisher.s, g }))
+        Ok((PrincipalMean::new(fisher, g), first))
     }
 
-    fn parameter(self, mean: &PolarMean, near: &Concentrations) -> Result<ProperSvd, FilterError> {
+    fn parameter(
+        self,
+        mean: &PrincipalMean,
+        near: &FirstMoments,
+    ) -> Result<ProperSvd, FilterError> {
         if self == Self::SevenPoints {
             return Ok(*matrix_fisher_of_seven(&mean.matrix(), SEVEN_POINT_SPREAD)?.svd());
         }
-        let (u, g, v) = mean.principal();
+        let g = mean.complement;
         let approximate = || match 1.0 - g[0] {
             d if d < NEAR_UNIFORM_MOMENT => Some(s_near_uniform(&g.map(|g| 1.0 - g))),
             d if d > CONCENTRATED_MOMENT => s_concentrated(&g),
@@ -124,15 +108,13 @@ impl MomentMap {
         };
         let s = match s {
             Some(s) => in_order(&s),
-            None => {
-                s_from_complement_near(&g, &near.predicted(&g)).map_err(MatrixFisherError::from)?
-            }
+            None => near.neighbour(&g).map_err(MatrixFisherError::from)?,
         };
-        Ok(ProperSvd { u, s, v })
+        Ok(ProperSvd { u: mean.axes_in_world, s, v: mean.axes_in_body() })
     }
 }
 
-/// Singular values in order also where the rounding of almost equal moments has exchanged them.
+/// Singular values in order also where the rounding of almost equal ones has exchanged them.
 fn in_order(s: &Vector3<f64>) -> Vector3<f64> {
     let s1 = s[0].max(0.0);
     let s2 = s[1].clamp(0.0, s1);
@@ -151,11 +133,11 @@ impl BayesFilter for BayesFisher {
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
         let turn = exp(&(step.angular_velocity * step.seconds));
-        let q = self.gyro.noise * step.seconds;
+        let q = || self.gyro.noise * step.seconds;
         let mean = match (self.gyro.isotropic_variance(step.seconds), self.gyro.frame) {
             (Some(variance), _) => self.mean.diffused(variance),
-            (None, Frame::Body) => self.mean.diffused_in_body(&q)?,
-            (None, Frame::World) => self.mean.diffused_in_world(&q)?,
+            (None, Frame::Body) => self.mean.polar().diffused_in_body(&q())?.principal(),
+            (None, Frame::World) => self.mean.polar().diffused_in_world(&q())?.principal(),
         };
         let mean = match self.gyro.frame {
             Frame::Body => mean.turned(&turn),

@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Rotation3};
 use super::super::bayes::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorMeasurement,
 };
-use super::invariant::{conjugated, propagated_covariance};
+use super::invariant::conjugated;
 use super::{GyroModel, gaussian_covariance, information_of, symmetric};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::so3::{exp, hat, proper_polar};
@@ -20,53 +20,67 @@ const LEAST_INFORMATION: f64 = 1e-9;
 /// error, and whose posterior is Bayes' rule on SO(3).
 ///
 /// The covariance is carried between measurements and the parameter formed only for Bayes' rule,
-/// by (31); polar decompositions, no singular values. Vectors of any length with any covariance
+/// by (31); polar decompositions, no singular values. It is that of the body-frame error for both
+/// filters, `P_R = R P_L R^T`: all that tells them apart is when the noise enters, (37) before the
+/// turn and (49) after it, and only anisotropic noise knows the difference. Vectors of any length with any covariance
 /// are admissible; weights in Wahba's problem are the inverse mean variances. Where that problem
 /// has no unique solution (a single direction) the likelihood is that of the direction, as in
 /// W22 (4.14).
 #[derive(Debug, Clone, Copy)]
 pub struct FastNonlinear {
-    /// Frame of the invariant error: the world's for FNF-R, the body's for FNF-L.
+    /// Frame of the invariant error that is linearised: the world's for FNF-R, the body's for
+    /// FNF-L.
     error: Frame,
     gyro: GyroModel,
     mode: Rotation3<f64>,
-    /// Covariance of the error in its frame, rad^2.
+    /// Covariance of the error in the body frame, rad^2.
     covariance: Matrix3<f64>,
 }
 
 impl FastNonlinear {
     /// The filter that starts from `prior` with its error in the frame `error`.
     pub fn new(error: Frame, gyro: &GyroModel, prior: &MatrixFisher) -> Self {
-        let mode = prior.mode();
-        let in_body = covariance_of(&prior.information(), || gaussian_covariance(prior));
-        let covariance = match error {
-            Frame::World => conjugated(&mode, &in_body),
-            Frame::Body => in_body,
-        };
-        Self { error, gyro: *gyro, mode, covariance }
+        let covariance = covariance_of(&prior.information(), || gaussian_covariance(prior));
+        Self { error, gyro: *gyro, mode: prior.mode(), covariance }
     }
 
     /// Bayes' rule with the likelihood `exp(tr(added^T R))`.
     fn fuse(&mut self, added: &Matrix3<f64>) -> Result<(), FilterError> {
-        let n = parameter_of_covariance(&self.covariance)?;
-        let prior = match self.error {
-            Frame::World => n * self.mode.matrix(),
-            Frame::Body => self.mode.matrix() * n,
-        };
+        let prior = self.mode.matrix() * parameter_of_covariance(&self.covariance)?;
         let (mode, k) = proper_polar(&(prior + added))?;
         let information = information_of(&k);
-        let in_body = covariance_of(&information, || {
+        let covariance = covariance_of(&information, || {
             let eigen = information.symmetric_eigen();
             let variance = eigen.eigenvalues.map(|a| a.max(LEAST_INFORMATION).recip());
             eigen.eigenvectors * Matrix3::from_diagonal(&variance) * eigen.eigenvectors.transpose()
         });
-        super::finite("posterior", in_body.as_slice())?;
-        self.covariance = match self.error {
-            Frame::World => conjugated(&mode, &in_body),
-            Frame::Body => in_body,
-        };
-        self.mode = mode;
+        super::finite("posterior", covariance.as_slice())?;
+        (self.mode, self.covariance) = (mode, covariance);
         Ok(())
+    }
+
+    /// The covariance after a turn by which the attitude becomes `next`, and the noise of it.
+    fn propagated(
+        &self,
+        turn: &Rotation3<f64>,
+        next: &Rotation3<f64>,
+        seconds: f64,
+    ) -> Matrix3<f64> {
+        let back = turn.inverse();
+        let turned = |p: &Matrix3<f64>| match self.gyro.frame {
+            Frame::Body => conjugated(&back, p),
+            Frame::World => *p,
+        };
+        if let Some(variance) = self.gyro.isotropic_variance(seconds) {
+            return turned(&self.covariance) + Matrix3::from_diagonal_element(variance);
+        }
+        let q = self.gyro.noise * seconds;
+        match (self.error, self.gyro.frame) {
+            (Frame::World, Frame::Body) => turned(&(self.covariance + q)),
+            (Frame::Body, Frame::Body) => turned(&self.covariance) + q,
+            (Frame::World, Frame::World) => self.covariance + conjugated(&next.inverse(), &q),
+            (Frame::Body, Frame::World) => self.covariance + conjugated(&self.mode.inverse(), &q),
+        }
     }
 
     /// The parameter of the likelihood of `measured` by the linearised Wahba problem, (44)/(51).
@@ -84,7 +98,6 @@ impl FastNonlinear {
             let parameters = measured.iter().map(VectorMeasurement::parameter);
             return parameters.sum::<Result<Matrix3<f64>, _>>();
         };
-        // In the body frame; the covariance in the world's is its conjugate.
         let mut covariance = Matrix3::zeros();
         for m in measured {
             let known_in_body = match m.measured_in {
@@ -134,13 +147,12 @@ impl BayesFilter for FastNonlinear {
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
         let turn = exp(&(step.angular_velocity * step.seconds));
-        let q = self.gyro.noise * step.seconds;
-        let frames = (self.error, self.gyro.frame);
-        self.covariance = propagated_covariance(&self.covariance, frames, &self.mode, &turn, &q);
-        self.mode = match self.gyro.frame {
+        let next = match self.gyro.frame {
             Frame::Body => self.mode * turn,
             Frame::World => turn * self.mode,
         };
+        self.covariance = self.propagated(&turn, &next, step.seconds);
+        self.mode = next;
         Ok(())
     }
 
@@ -159,15 +171,11 @@ impl BayesFilter for FastNonlinear {
     }
 
     fn estimate(&self) -> Estimate {
-        let in_body = match self.error {
-            Frame::World => conjugated(&self.mode.inverse(), &self.covariance),
-            Frame::Body => self.covariance,
-        };
-        let information = in_body.try_inverse();
+        let information = self.covariance.try_inverse();
         let fisher =
             information.and_then(|h| MatrixFisher::from_mode_and_information(self.mode, h).ok());
         fisher.map_or_else(
-            || Estimate::of_attitude(self.mode, in_body),
+            || Estimate::of_attitude(self.mode, self.covariance),
             |fisher| Estimate::of_matrix_fisher(&fisher),
         )
     }

@@ -62,7 +62,7 @@ pub(super) fn conjugated(r: &Rotation3<f64>, m: &Matrix3<f64>) -> Matrix3<f64> {
 
 /// The covariance of the error in `error` after a turn `turn` and noise `q`, both resolved in
 /// `rate`, at the attitude `attitude` before the turn.
-pub(super) fn propagated_covariance(
+fn propagated_covariance(
     covariance: &Matrix3<f64>,
     (error, rate): (Frame, Frame),
     attitude: &Rotation3<f64>,

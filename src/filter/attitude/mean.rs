@@ -1,12 +1,13 @@
-//! The mean `E[R]` of an attitude belief in polar form, and its propagation.
+//! The mean `E[R]` of an attitude belief in principal axes or in polar form, and its propagation.
 //!
 //! A matrix Fisher distribution is determined by its mean. Between measurements the first-order
 //! filter changes only the mean, and linearly (L-AMF 13), so that the parameter is needed only
 //! where a measurement arrives: propagating the mean is the same filter at a fraction of the cost.
+//! Isotropic noise and turns do not even change its principal axes in the world.
 
-use nalgebra::{Matrix3, Rotation3, SymmetricEigen, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 
-use crate::so3::{NotFinite, ProperSvd, exp, proper_svd, vee};
+use crate::so3::{NotFinite, ProperSvd, exp, principal_axes, proper_svd, vee};
 
 /// Newton steps of the polar decomposition of a matrix that is almost symmetric.
 const POLAR_STEPS: usize = 4;
@@ -14,6 +15,58 @@ const POLAR_STEPS: usize = 4;
 const POLAR_TOLERANCE: f64 = 1e-8;
 /// Smallest ratio of the least to the largest `d_j + d_k` for which Newton's step is used.
 const POLAR_CONDITION: f64 = 1e-2;
+
+/// `E[R] = U (I - diag g) V^T` with `g` ascending.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct PrincipalMean {
+    /// `U V^T`.
+    pub mode: Rotation3<f64>,
+    /// `U`.
+    pub axes_in_world: Rotation3<f64>,
+    /// `g`, which keeps its digits where the mean is close to a rotation.
+    pub complement: Vector3<f64>,
+}
+
+impl PrincipalMean {
+    /// The mean of a distribution with the axes of `fisher`.
+    pub fn new(fisher: &ProperSvd, complement: Vector3<f64>) -> Self {
+        Self { mode: fisher.rotation(), axes_in_world: fisher.u, complement }
+    }
+
+    /// `E[R]`.
+    pub fn matrix(&self) -> Matrix3<f64> {
+        let s = self.complement.map(|g| 1.0 - g);
+        ProperSvd { u: self.axes_in_world, s, v: self.axes_in_body() }.matrix()
+    }
+
+    /// `V`.
+    pub fn axes_in_body(&self) -> Rotation3<f64> {
+        self.mode.inverse() * self.axes_in_world
+    }
+
+    /// The mean after a turn by `turn` in the body frame.
+    pub fn turned(&self, turn: &Rotation3<f64>) -> Self {
+        Self { mode: self.mode * turn, ..*self }
+    }
+
+    /// The mean after a turn by `turn` in the world frame.
+    pub fn turned_in_world(&self, turn: &Rotation3<f64>) -> Self {
+        Self { mode: turn * self.mode, axes_in_world: turn * self.axes_in_world, ..*self }
+    }
+
+    /// The mean after isotropic diffusion of `variance` rad^2 about each axis, in any frame:
+    /// `E[R] exp(-variance)`.
+    pub fn diffused(&self, variance: f64) -> Self {
+        let lost = -(-variance).exp_m1();
+        Self { complement: self.complement.map(|g| g + lost * (1.0 - g)), ..*self }
+    }
+
+    pub fn polar(&self) -> PolarMean {
+        let v = self.axes_in_body();
+        let complement = ProperSvd { u: v, s: self.complement, v }.matrix();
+        PolarMean { mode: self.mode, complement }
+    }
+}
 
 /// `E[R] = mode (I - complement)`: `complement` is symmetric, in body coordinates, and keeps its
 /// digits where the mean is close to a rotation.
@@ -24,47 +77,11 @@ pub(super) struct PolarMean {
 }
 
 impl PolarMean {
-    /// The mean `U (I - diag g) V^T`.
-    pub fn from_principal(u: &Rotation3<f64>, g: &Vector3<f64>, v: &Rotation3<f64>) -> Self {
-        let v_transposed = v.inverse();
-        let complement = v.matrix() * Matrix3::from_diagonal(g) * v_transposed.matrix();
-        Self { mode: u * v_transposed, complement }
-    }
-
-    /// `E[R]`.
-    pub fn matrix(&self) -> Matrix3<f64> {
-        self.mode.matrix() * (Matrix3::identity() - self.complement)
-    }
-
-    /// `(U, g, V)` with `E[R] = U (I - diag g) V^T` and `g` ascending.
-    pub fn principal(&self) -> (Rotation3<f64>, Vector3<f64>, Rotation3<f64>) {
-        let eigen = SymmetricEigen::new(self.complement);
-        let mut order = [0, 1, 2];
-        order.sort_by(|&i, &j| eigen.eigenvalues[i].total_cmp(&eigen.eigenvalues[j]));
-        let [x, y] = [order[0], order[1]].map(|i| eigen.eigenvectors.column(i).into_owned());
-        let axes = Matrix3::from_columns(&[x, y, x.cross(&y)]);
-        let v = Rotation3::from_matrix_unchecked(axes);
-        let g = Vector3::from(order.map(|i| eigen.eigenvalues[i]));
-        (self.mode * v, g, v)
-    }
-
-    /// The mean after a turn by `turn` in the body frame.
-    pub fn turned(&self, turn: &Rotation3<f64>) -> Self {
-        let complement = turn.matrix().transpose() * self.complement * turn.matrix();
-        Self { mode: self.mode * turn, complement }
-    }
-
-    /// The mean after a turn by `turn` in the world frame.
-    pub fn turned_in_world(&self, turn: &Rotation3<f64>) -> Self {
-        Self { mode: turn * self.mode, complement: self.complement }
-    }
-
-    /// The mean after isotropic diffusion of `variance` rad^2 about each axis, in any frame:
-    /// `E[R] exp(-variance)`.
-    pub fn diffused(&self, variance: f64) -> Self {
-        let kept = (-variance).exp();
-        let lost = -(-variance).exp_m1();
-        Self { mode: self.mode, complement: self.complement * kept + Matrix3::identity() * lost }
+    /// The principal axes.
+    pub fn principal(&self) -> PrincipalMean {
+        let (axes, negated) = principal_axes(&-self.complement);
+        let axes_in_world = self.mode * axes;
+        PrincipalMean { mode: self.mode, axes_in_world, complement: -negated }
     }
 
     /// The mean after diffusion with the covariance `q`, rad^2, of rotation vectors in the body
@@ -98,7 +115,7 @@ impl PolarMean {
             }
         }
         let ProperSvd { u, s, v } = proper_svd(&(Matrix3::identity() - x))?;
-        let centred = Self::from_principal(&u, &s.map(|d| 1.0 - d), &v);
+        let centred = PrincipalMean::new(&ProperSvd { u, s, v }, s.map(|d| 1.0 - d)).polar();
         Ok(Self { mode: mode * centred.mode, ..centred })
     }
 }
@@ -141,13 +158,19 @@ mod tests {
             let mut g = g;
             g.sort_by(f64::total_cmp);
             let g = Vector3::from(g) * scale;
-            let mean = PolarMean::from_principal(&v, &g, &v);
+            let principal = PrincipalMean {
+                mode: Rotation3::identity(), axes_in_world: v, complement: g,
+            };
+            let mean = principal.polar();
             let q = exp(&turn);
             let x = Matrix3::identity() - q.matrix() * (Matrix3::identity() - mean.complement);
             let found = PolarMean::from_deviation(&exp(&Vector3::new(1.0, 0.0, 2.0)), &x).unwrap();
             let expected = exp(&Vector3::new(1.0, 0.0, 2.0)) * q;
             prop_assert!((found.complement - mean.complement).amax() < 1e-12);
             prop_assert!((found.mode.matrix() - expected.matrix()).amax() < 1e-8);
+            let again = found.principal().polar();
+            prop_assert!((again.complement - mean.complement).amax() < 1e-12);
+            prop_assert!((again.mode.matrix() - found.mode.matrix()).amax() == 0.0);
         }
     }
 

@@ -120,9 +120,9 @@ pub(super) fn propagate(
         let q_times_deviation = Matrix3::from_column_slice(with_deviation.column(l).as_slice());
         x -= q_times_deviation * hat(&slope.column(l).into_owned());
     }
-    let mean = PolarMean::from_deviation(&Rotation3::identity(), &x)?;
-    let (turn_u, g, turn_v) = mean.principal();
-    let s_next = s_from_complement_near(&g, &s).map_err(MatrixFisherError::from)?;
+    let mean = PolarMean::from_deviation(&Rotation3::identity(), &x)?.principal();
+    let (turn_u, turn_v) = (mean.axes_in_world, mean.axes_in_body());
+    let s_next = s_from_complement_near(&mean.complement, &s).map_err(MatrixFisherError::from)?;
     let svd = ProperSvd { u: u * turn_u, s: s_next, v: exp(&-angle) * v * turn_v };
     let attitude = MatrixFisher::from_svd(svd).map_err(MatrixFisherError::from)?;
 
