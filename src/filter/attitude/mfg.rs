@@ -20,6 +20,14 @@ use crate::so3::{ProperSvd, exp};
 const ATTITUDE_WEIGHT: f64 = 0.9;
 /// Weight of the sigma points that move the bias, `w_G`.
 const BIAS_WEIGHT: f64 = 0.08;
+/// Least cosine of the turn of a sigma point.
+///
+/// Beyond a right angle a further turn makes `v_R = (tr(S) I - S) sin t` smaller instead of larger,
+/// so that the correlation of bias and attitude, which is negative, feeds on itself: its rate is
+/// `dP/dt = P^2 (s_j + s_k) cos t` at the points, and for the distribution, damping,
+/// `P^2 (s_j + s_k) E[sin^2 t cos t]/E[sin^2 t]`. Within minutes the bias was thrown out to infinity
+/// (table 4.7 with `sigma2 = 200`).
+const LEAST_COSINE: f64 = 0.0;
 
 /// How the belief is carried through the kinematics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,7 +35,7 @@ pub enum MfgPropagation {
     /// By its moments (table 4.3).
     Moments,
     /// By 13 sigma points, each with six of the noise (table 4.4); by moments where the belief is
-    /// so close to uniform that it has no such points.
+    /// so broad that they would lie more than a right angle from the mode.
     SigmaPoints,
 }
 
@@ -110,6 +118,11 @@ impl AttitudeMfg {
         let factor = (self.gyro.noise * h).cholesky();
         let spread = factor.map_or_else(Matrix3::zeros, |factor| factor.l() * 3f64.sqrt());
         let points = self.belief.sigma_points(ATTITUDE_WEIGHT, BIAS_WEIGHT)?;
+        let back = self.belief.attitude().mode().inverse();
+        let cosine = |r: &Rotation3<f64>| 0.5 * ((back * r).matrix().trace() - 1.0);
+        if points.iter().any(|point| cosine(&point.attitude) < LEAST_COSINE) {
+            return Err(UnscentedError::TooBroad(ATTITUDE_WEIGHT).into());
+        }
         let mut propagated = Vec::with_capacity(6 * points.len());
         for point in &points {
             let angle = (step.angular_velocity - point.x) * h;
