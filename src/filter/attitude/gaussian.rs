@@ -1,4 +1,5 @@
-//! The multiplicative extended Kalman filter of attitude and gyro bias.
+//! The multiplicative extended Kalman filter of attitude and gyro bias, and the belief that it
+//! shares with the unscented one.
 
 use nalgebra::{Matrix3, Matrix6, Matrix6x3, Rotation3, Vector3, Vector6};
 
@@ -10,22 +11,20 @@ use super::invariant::{conjugated, linearized_attitude, linearized_directions};
 use super::{AttitudePrior, GyroModel};
 use crate::so3::{exp, left_jacobian, right_jacobian};
 
-/// A Gaussian of rotation vector and bias; the rotation vector acts in the body frame (`mekf`,
-/// W22 1.3) or in the inertial frame (`mekf-i`, 1.4).
+/// A Gaussian of a rotation vector, which acts on an attitude, and of the gyro bias.
 #[derive(Debug, Clone, Copy)]
-pub struct AttitudeMekf {
-    error: Frame,
-    gyro: GyroModel,
-    attitude: Rotation3<f64>,
-    bias: Vector3<f64>,
+pub(super) struct GaussianBelief {
+    /// Frame in which the rotation vector acts.
+    pub error: Frame,
+    pub attitude: Rotation3<f64>,
+    /// rad/s.
+    pub bias: Vector3<f64>,
     /// Of (rotation vector, bias).
-    covariance: Matrix6<f64>,
+    pub covariance: Matrix6<f64>,
 }
 
-impl AttitudeMekf {
-    /// The filter that starts from `prior` with its error in the frame `error`.
-    pub fn new(error: Frame, gyro: &GyroModel, prior: &AttitudePrior) -> Result<Self, FilterError> {
-        super::requires_body_rate(gyro)?;
+impl GaussianBelief {
+    pub fn new(error: Frame, prior: &AttitudePrior) -> Result<Self, FilterError> {
         let (attitude, in_body) = prior.gaussian()?;
         let rotation = match error {
             Frame::World => conjugated(&attitude, &in_body),
@@ -33,7 +32,66 @@ impl AttitudeMekf {
         };
         let covariance = joint_covariance(&rotation, &prior.gyro_bias_covariance);
         covariance.cholesky().ok_or(FilterError::NotPositive("prior covariance"))?;
-        Ok(Self { error, gyro: *gyro, attitude, bias: prior.gyro_bias, covariance })
+        Ok(Self { error, attitude, bias: prior.gyro_bias, covariance })
+    }
+
+    /// Moves the mean.
+    pub fn apply(&mut self, correction: &Vector6<f64>) {
+        let turn = exp(&correction.fixed_rows::<3>(0).into_owned());
+        self.attitude = match self.error {
+            Frame::World => turn * self.attitude,
+            Frame::Body => self.attitude * turn,
+        };
+        self.bias += correction.fixed_rows::<3>(3);
+    }
+
+    /// Conditions on a measured bias, in Joseph's form.
+    pub fn condition_on_bias(&mut self, measured: &VectorEstimate) -> Result<(), FilterError> {
+        let residual = measured.mean - self.bias;
+        let innovation = self.covariance.fixed_view::<3, 3>(3, 3) + measured.covariance;
+        let inverse = innovation.try_inverse();
+        let gain = self.covariance.fixed_columns::<3>(3)
+            * inverse.ok_or(FilterError::NotPositive("innovation covariance"))?;
+        let mut kept = Matrix6::identity();
+        let mut right = kept.fixed_columns_mut::<3>(3);
+        right -= gain;
+        let posterior = kept * self.covariance * kept.transpose()
+            + gain * measured.covariance * gain.transpose();
+        let correction = gain * residual;
+        super::finite("posterior", correction.as_slice())?;
+        super::finite("posterior", posterior.as_slice())?;
+        self.covariance = 0.5 * (posterior + posterior.transpose());
+        self.apply(&correction);
+        Ok(())
+    }
+
+    pub fn estimate(&self) -> Estimate {
+        let rotation = self.covariance.fixed_view::<3, 3>(0, 0).into_owned();
+        let in_body = match self.error {
+            Frame::World => conjugated(&self.attitude.inverse(), &rotation),
+            Frame::Body => rotation,
+        };
+        let covariance = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
+        Estimate {
+            gyro_bias: Some(VectorEstimate { mean: self.bias, covariance }),
+            ..Estimate::of_attitude(self.attitude, in_body)
+        }
+    }
+}
+
+/// The filter that linearises; the rotation vector acts in the body frame (`mekf`, W22 1.3) or in
+/// the inertial frame (`mekf-i`, 1.4).
+#[derive(Debug, Clone, Copy)]
+pub struct AttitudeMekf {
+    gyro: GyroModel,
+    belief: GaussianBelief,
+}
+
+impl AttitudeMekf {
+    /// The filter that starts from `prior` with its error in the frame `error`.
+    pub fn new(error: Frame, gyro: &GyroModel, prior: &AttitudePrior) -> Result<Self, FilterError> {
+        super::requires_body_rate(gyro)?;
+        Ok(Self { gyro: *gyro, belief: GaussianBelief::new(error, prior)? })
     }
 
     /// Conditions on `information e = vector` for the rotation error `e`, in Joseph's form.
@@ -42,53 +100,23 @@ impl AttitudeMekf {
         information: &Matrix3<f64>,
         vector: &Vector3<f64>,
     ) -> Result<(), FilterError> {
-        let rotation = self.covariance.fixed_view::<3, 3>(0, 0).into_owned();
-        let columns = self.covariance.fixed_columns::<3>(0).into_owned();
+        let prior = &self.belief.covariance;
+        let rotation = prior.fixed_view::<3, 3>(0, 0).into_owned();
+        let columns = prior.fixed_columns::<3>(0).into_owned();
         let factor = (Matrix3::identity() + information * rotation).try_inverse();
         let gain: Matrix6x3<f64> =
             columns * factor.ok_or(FilterError::NotPositive("innovation covariance"))?;
         let mut kept = Matrix6::identity();
         let mut left = kept.fixed_columns_mut::<3>(0);
         left -= gain * information;
-        let covariance =
-            kept * self.covariance * kept.transpose() + gain * information * gain.transpose();
+        let covariance = kept * prior * kept.transpose() + gain * information * gain.transpose();
         let correction = gain * vector;
         super::finite("posterior", correction.as_slice())?;
         super::finite("posterior", covariance.as_slice())?;
-        self.covariance = 0.5 * (covariance + covariance.transpose());
-        self.apply(&correction);
+        self.belief.covariance = 0.5 * (covariance + covariance.transpose());
+        self.belief.apply(&correction);
         Ok(())
     }
-
-    fn apply(&mut self, correction: &Vector6<f64>) {
-        let turn = exp(&correction.fixed_rows::<3>(0).into_owned());
-        self.attitude = match self.error {
-            Frame::World => turn * self.attitude,
-            Frame::Body => self.attitude * turn,
-        };
-        self.bias += correction.fixed_rows::<3>(3);
-    }
-}
-
-/// Correction and covariance of (rotation vector, bias) after a measurement of the bias that
-/// differs by `residual` from the expected one, in Joseph's form.
-pub(super) fn conditioned_on_bias(
-    covariance: &Matrix6<f64>,
-    residual: &Vector3<f64>,
-    noise: &Matrix3<f64>,
-) -> Result<(Vector6<f64>, Matrix6<f64>), FilterError> {
-    let innovation = covariance.fixed_view::<3, 3>(3, 3) + noise;
-    let inverse = innovation.try_inverse();
-    let gain = covariance.fixed_columns::<3>(3)
-        * inverse.ok_or(FilterError::NotPositive("innovation covariance"))?;
-    let mut kept = Matrix6::identity();
-    let mut right = kept.fixed_columns_mut::<3>(3);
-    right -= gain;
-    let posterior = kept * covariance * kept.transpose() + gain * noise * gain.transpose();
-    let correction = gain * residual;
-    super::finite("posterior", correction.as_slice())?;
-    super::finite("posterior", posterior.as_slice())?;
-    Ok((correction, 0.5 * (posterior + posterior.transpose())))
 }
 
 /// Rotation and bias, uncorrelated.
@@ -101,7 +129,7 @@ pub(super) fn joint_covariance(rotation: &Matrix3<f64>, bias: &Matrix3<f64>) -> 
 
 impl BayesFilter for AttitudeMekf {
     fn name(&self) -> &'static str {
-        match self.error {
+        match self.belief.error {
             Frame::World => "mekf-i",
             Frame::Body => "mekf",
         }
@@ -110,53 +138,51 @@ impl BayesFilter for AttitudeMekf {
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
         let h = step.seconds;
-        let angle = (step.angular_velocity - self.bias) * h;
+        let GaussianBelief { error, attitude, bias, covariance } = &mut self.belief;
+        let angle = (step.angular_velocity - *bias) * h;
         let turn = exp(&angle);
         // Body: e+ = E^T e - h J_r b - n. World: e+ = e - R (h J_l b + E n).
-        let (by_error, by_bias, q) = match self.error {
+        let (by_error, by_bias, q) = match error {
             Frame::Body => {
                 (turn.inverse().into_inner(), right_jacobian(&angle) * -h, self.gyro.noise * h)
             }
             Frame::World => (
                 Matrix3::identity(),
-                self.attitude.matrix() * left_jacobian(&angle) * -h,
-                conjugated(&(self.attitude * turn), &(self.gyro.noise * h)),
+                attitude.matrix() * left_jacobian(&angle) * -h,
+                conjugated(&(*attitude * turn), &(self.gyro.noise * h)),
             ),
         };
         let mut transition = Matrix6::identity();
         transition.fixed_view_mut::<3, 3>(0, 0).copy_from(&by_error);
         transition.fixed_view_mut::<3, 3>(0, 3).copy_from(&by_bias);
         let noise = joint_covariance(&q, &(self.gyro.bias_walk * h));
-        self.covariance = transition * self.covariance * transition.transpose() + noise;
-        self.attitude *= turn;
+        *covariance = transition * *covariance * transition.transpose() + noise;
+        *attitude *= turn;
         Ok(())
     }
 
     fn update_attitude(&mut self, measured: &AttitudeMeasurement) -> Result<(), FilterError> {
-        let (information, vector) = linearized_attitude(measured, self.error, &self.attitude)?;
+        let GaussianBelief { error, attitude, .. } = &self.belief;
+        let (information, vector) = linearized_attitude(measured, *error, attitude)?;
         self.correct(&information, &vector)
     }
 
     fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
-        let (information, vector) = linearized_directions(measured, self.error, &self.attitude)?;
+        let GaussianBelief { error, attitude, .. } = &self.belief;
+        let (information, vector) = linearized_directions(measured, *error, attitude)?;
         self.correct(&information, &vector)
     }
 
     fn update_gyro_bias(&mut self, measured: &VectorEstimate) -> Result<(), FilterError> {
-        let residual = measured.mean - self.bias;
-        let (correction, covariance) =
-            conditioned_on_bias(&self.covariance, &residual, &measured.covariance)?;
-        self.covariance = covariance;
-        self.apply(&correction);
-        Ok(())
+        self.belief.condition_on_bias(measured)
     }
 
     fn attitude(&self) -> Rotation3<f64> {
-        self.attitude
+        self.belief.attitude
     }
 
     fn gyro_bias(&self) -> Option<Vector3<f64>> {
-        Some(self.bias)
+        Some(self.belief.bias)
     }
 
     fn is_gaussian(&self) -> bool {
@@ -164,15 +190,6 @@ impl BayesFilter for AttitudeMekf {
     }
 
     fn estimate(&self) -> Estimate {
-        let rotation = self.covariance.fixed_view::<3, 3>(0, 0).into_owned();
-        let in_body = match self.error {
-            Frame::World => conjugated(&self.attitude.inverse(), &rotation),
-            Frame::Body => rotation,
-        };
-        let covariance = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
-        Estimate {
-            gyro_bias: Some(VectorEstimate { mean: self.bias, covariance }),
-            ..Estimate::of_attitude(self.attitude, in_body)
-        }
+        self.belief.estimate()
     }
 }

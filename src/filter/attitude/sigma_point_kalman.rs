@@ -3,10 +3,10 @@
 use nalgebra::{Matrix3, Matrix3x6, Matrix6, Matrix6x3, Rotation3, SVector, Vector3, Vector6};
 
 use super::super::bayes::{
-    AttitudeMeasurement, BayesFilter, Estimate, FilterError, InertialStep, VectorEstimate,
+    AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorEstimate,
     VectorMeasurement,
 };
-use super::gaussian::{conditioned_on_bias, joint_covariance};
+use super::gaussian::{GaussianBelief, joint_covariance};
 use super::{AttitudePrior, GyroModel, information_of, symmetric};
 use crate::so3::{exp, log};
 
@@ -22,19 +22,14 @@ const POINTS: usize = 2 * N + 1;
 #[derive(Debug, Clone, Copy)]
 pub struct AttitudeUkf {
     gyro: GyroModel,
-    attitude: Rotation3<f64>,
-    bias: Vector3<f64>,
-    covariance: Matrix6<f64>,
+    belief: GaussianBelief,
 }
 
 impl AttitudeUkf {
     /// The filter that starts from `prior`.
     pub fn new(gyro: &GyroModel, prior: &AttitudePrior) -> Result<Self, FilterError> {
         super::requires_body_rate(gyro)?;
-        let (attitude, in_body) = prior.gaussian()?;
-        let covariance = joint_covariance(&in_body, &prior.gyro_bias_covariance);
-        covariance.cholesky().ok_or(FilterError::NotPositive("prior covariance"))?;
-        Ok(Self { gyro: *gyro, attitude, bias: prior.gyro_bias, covariance })
+        Ok(Self { gyro: *gyro, belief: GaussianBelief::new(Frame::Body, prior)? })
     }
 
     /// Deviations of the sigma points, the centre first.
@@ -65,18 +60,13 @@ impl AttitudeUkf {
         }
         let inverse = innovation.try_inverse();
         let gain = cross * inverse.ok_or(FilterError::NotPositive("innovation covariance"))?;
-        let covariance = self.covariance - gain * innovation * gain.transpose();
+        let covariance = self.belief.covariance - gain * innovation * gain.transpose();
         let covariance = 0.5 * (covariance + covariance.transpose());
         covariance.cholesky().ok_or(FilterError::NotPositive("posterior covariance"))?;
         let correction = -gain * mean;
         super::finite("posterior", correction.as_slice())?;
-        self.covariance = covariance;
+        self.belief.covariance = covariance;
         Ok(correction)
-    }
-
-    fn apply(&mut self, correction: &Vector6<f64>) {
-        self.attitude *= exp(&correction.fixed_rows::<3>(0).into_owned());
-        self.bias += correction.fixed_rows::<3>(3);
     }
 }
 
@@ -102,9 +92,9 @@ impl BayesFilter for AttitudeUkf {
         step.check()?;
         let h = step.seconds;
         let half = joint_covariance(&(self.gyro.noise * (0.5 * h)), &Matrix3::zeros());
-        let deviations = self.deviations(&(self.covariance + half))?;
+        let deviations = self.deviations(&(self.belief.covariance + half))?;
         let turned = |d: &Vector6<f64>| {
-            let rate = step.angular_velocity - self.bias - d.fixed_rows::<3>(3);
+            let rate = step.angular_velocity - self.belief.bias - d.fixed_rows::<3>(3);
             rotation_part(d) * exp(&(rate * h))
         };
         let centre = turned(&deviations[0]);
@@ -122,9 +112,9 @@ impl BayesFilter for AttitudeUkf {
         }
         covariance += joint_covariance(&Matrix3::zeros(), &(self.gyro.bias_walk * h));
         covariance.cholesky().ok_or(FilterError::NotPositive("covariance"))?;
-        self.attitude *= centre;
-        self.covariance = 0.5 * (covariance + covariance.transpose());
-        self.apply(&mean);
+        self.belief.attitude *= centre;
+        self.belief.covariance = 0.5 * (covariance + covariance.transpose());
+        self.belief.apply(&mean);
         Ok(())
     }
 
@@ -133,16 +123,16 @@ impl BayesFilter for AttitudeUkf {
         // Linear in the rotation vector: axis by axis in the principal frame of the noise, so
         // that an axis of which nothing is measured does not matter.
         let information = information_of(&symmetric(&measured.noise)).symmetric_eigen();
-        let residual = log(&(self.attitude.inverse() * measured.world_from_body));
+        let residual = log(&(self.belief.attitude.inverse() * measured.world_from_body));
         let axes = information.eigenvectors.transpose();
         let mut by_state = Matrix3x6::zeros();
         by_state.fixed_columns_mut::<3>(0).copy_from(&axes);
         let variance = information.eigenvalues.map(|a| a.max(1e-9).recip());
-        let deviations = self.deviations(&self.covariance)?;
+        let deviations = self.deviations(&self.belief.covariance)?;
         let residuals = deviations.map(|d| by_state * d - axes * residual);
         let noise = Matrix3::from_diagonal(&variance);
         let correction = self.correct(&deviations, &residuals, &noise)?;
-        self.apply(&correction);
+        self.belief.apply(&correction);
         Ok(())
     }
 
@@ -150,18 +140,18 @@ impl BayesFilter for AttitudeUkf {
         let before = *self;
         for m in measured {
             let corrected = m.check().and_then(|()| {
-                let deviations = self.deviations(&self.covariance)?;
+                let deviations = self.deviations(&self.belief.covariance)?;
                 let residuals = deviations.map(|d| {
-                    let attitude = self.attitude * rotation_part(&d);
+                    let attitude = self.belief.attitude * rotation_part(&d);
                     match m.measured_in {
-                        super::Frame::Body => attitude.inverse() * m.in_world - m.in_body,
-                        super::Frame::World => attitude * m.in_body - m.in_world,
+                        Frame::Body => attitude.inverse() * m.in_world - m.in_body,
+                        Frame::World => attitude * m.in_body - m.in_world,
                     }
                 });
                 self.correct(&deviations, &residuals, &m.covariance)
             });
             match corrected {
-                Ok(correction) => self.apply(&correction),
+                Ok(correction) => self.belief.apply(&correction),
                 Err(error) => {
                     *self = before;
                     return Err(error);
@@ -172,20 +162,15 @@ impl BayesFilter for AttitudeUkf {
     }
 
     fn update_gyro_bias(&mut self, measured: &VectorEstimate) -> Result<(), FilterError> {
-        let residual = measured.mean - self.bias;
-        let (correction, covariance) =
-            conditioned_on_bias(&self.covariance, &residual, &measured.covariance)?;
-        self.covariance = covariance;
-        self.apply(&correction);
-        Ok(())
+        self.belief.condition_on_bias(measured)
     }
 
     fn attitude(&self) -> Rotation3<f64> {
-        self.attitude
+        self.belief.attitude
     }
 
     fn gyro_bias(&self) -> Option<Vector3<f64>> {
-        Some(self.bias)
+        Some(self.belief.bias)
     }
 
     fn is_gaussian(&self) -> bool {
@@ -193,11 +178,6 @@ impl BayesFilter for AttitudeUkf {
     }
 
     fn estimate(&self) -> Estimate {
-        let rotation = self.covariance.fixed_view::<3, 3>(0, 0).into_owned();
-        let covariance = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
-        Estimate {
-            gyro_bias: Some(VectorEstimate { mean: self.bias, covariance }),
-            ..Estimate::of_attitude(self.attitude, rotation)
-        }
+        self.belief.estimate()
     }
 }
