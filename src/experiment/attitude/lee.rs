@@ -8,10 +8,10 @@ use rand_distr::Distribution;
 
 use super::super::{PaperValue, Report, Request, Study, StudyError, Trial, monte_carlo};
 use super::scene::{GyroNoise, Measured, Sampling, diagonal, pendulum, simulate};
-use super::{Case, Quantities, run_memoryless};
+use super::{AnyError, Case, Quantities, run_memoryless};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
-use crate::filter::{AttitudeMeasurement, FilterError, Frame};
+use crate::filter::{AttitudeMeasurement, Frame};
 use crate::so3::exp;
 
 pub(super) const STUDIES: &[Study] = &[
@@ -60,11 +60,11 @@ impl Pendulum {
     ) -> Result<Report, StudyError> {
         let motion = pendulum(INTERVAL, self.steps, Sampling::Mean);
         let noise = diagonal([40.0, 50.0, 35.0]);
-        let trial = |rng: &mut ChaCha8Rng| -> Result<Trial, FilterError> {
+        let trial = |rng: &mut ChaCha8Rng| -> Result<Trial, AnyError> {
             let sampler = MatrixFisher::new(&noise)?.sampler();
             let white =
                 GyroNoise { white: self.white, bias_walk: 0.0, initial_bias: Vector3::zeros() };
-            let scene = simulate(&motion, &white, EVERY, rng, |truth, rng| {
+            let scene = simulate(&motion, &white, EVERY, rng, |_, truth, rng| {
                 let world_from_body = truth * sampler.sample(rng);
                 Measured::attitude(AttitudeMeasurement { world_from_body, noise })
             });

@@ -1,34 +1,54 @@
-//! Attitude filters on the papers' scenes: W22 tables 4.2, 4.6, 4.7, FNF tables II to V, L-AMF
-//! table II and L-UAE cases I and II.
+//! Attitude filters on the papers' scenes: W22 tables 4.2, 4.6, 4.7, 4.8, FNF tables II to V,
+//! L-AMF table II and L-UAE cases I and II.
 //!
 //! A [`Scene`] is the truth and what the sensors said, drawn once; every filter of a case runs on
-//! the same one.
+//! the same one. Of each filter its consistency is reported beside its errors: `nees_...` of the
+//! belief, and `nis` of the measurements against what the filter predicts of them, both taken at
+//! [`CONSISTENCY_INSTANTS`] instants of the second half and scaled to three degrees of freedom.
 
+mod consistency;
 mod fnf;
 mod lee;
+mod magnetometer;
+mod orbit;
 mod scene;
 mod wang;
 
 use cpu_time::ThreadTime;
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use nalgebra::{Rotation3, Vector3};
 
 use super::{Observation, StepTime, Study, Trial};
 use crate::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel, wahba};
 use crate::filter::{BayesFilter, FilterError, Frame};
 use crate::so3::log;
-use scene::{Measured, Scene};
+use consistency::{normalized, normalized_innovation};
+use scene::{Measured, Modelled, Scene};
 
 /// The studies of this module, in the order of the list.
-pub const STUDIES: [&[Study]; 3] = [wang::STUDIES, fnf::STUDIES, lee::STUDIES];
+pub const STUDIES: [&[Study]; 4] =
+    [wang::STUDIES, magnetometer::STUDIES, fnf::STUDIES, lee::STUDIES];
 
-/// Instants of the second half of a run at which the normalised error is taken.
+/// Instants of the second half of a run at which normalised errors and innovations are taken.
 const CONSISTENCY_INSTANTS: usize = 50;
+
+type AnyError = Box<dyn std::error::Error + Send + Sync>;
+
+/// A filter that could not take a step.
+#[derive(Debug, thiserror::Error)]
+#[error("{filter}, case {case}, step {step}: {source}")]
+struct CaseError {
+    filter: &'static str,
+    case: &'static str,
+    step: usize,
+    source: FilterError,
+}
 
 /// What is reported of each filter.
 #[derive(Debug, Clone, Copy, Default)]
-struct Quantities {
-    /// The direction of which only the error counts: known in this frame.
-    partial: Option<(Frame, Vector3<f64>)>,
+struct Quantities<'a> {
+    /// The direction of which only the error counts: known in this frame, after each step or,
+    /// where it is fixed, once.
+    partial: Option<(Frame, &'a [Vector3<f64>])>,
     bias: bool,
     /// Steps at the beginning that do not count.
     settling: usize,
@@ -40,12 +60,12 @@ struct Case<'a> {
     gyro: GyroModel,
     prior: AttitudePrior,
     scene: &'a Scene,
-    quantities: Quantities,
+    quantities: Quantities<'a>,
 }
 
 impl Case<'_> {
     /// Runs each kind over the scene and appends its figures to the trial.
-    fn run(&self, trial: &mut Trial, kinds: &[AttitudeFilterKind]) -> Result<(), FilterError> {
+    fn run(&self, trial: &mut Trial, kinds: &[AttitudeFilterKind]) -> Result<(), AnyError> {
         kinds.iter().try_for_each(|&kind| self.run_as(trial, kind, kind.name()))
     }
 
@@ -55,10 +75,15 @@ impl Case<'_> {
         trial: &mut Trial,
         kind: AttitudeFilterKind,
         filter: &'static str,
-    ) -> Result<(), FilterError> {
+    ) -> Result<(), AnyError> {
         let Case { label: case, ref gyro, ref prior, scene, quantities } = *self;
         let mut running = kind.start(gyro, prior)?;
-        let log = follow(running.as_mut(), scene)?;
+        let log = follow(running.as_mut(), scene).map_err(|(step, source)| CaseError {
+            filter,
+            case,
+            step,
+            source,
+        })?;
         let mut push = |quantity, value| {
             trial.observations.push(Observation { case, filter, quantity, value });
         };
@@ -67,13 +92,14 @@ impl Case<'_> {
             "attitude_deg",
             mean(counted().map(|(truth, found)| angle(truth, found).to_degrees())),
         );
-        if let Some((frame, direction)) = quantities.partial {
-            let seen = |r: &Rotation3<f64>| match frame {
+        if let Some((frame, directions)) = quantities.partial {
+            let seen = |r: &Rotation3<f64>, direction: &Vector3<f64>| match frame {
                 Frame::World => r.inverse() * direction,
                 Frame::Body => r * direction,
             };
-            let errors = counted().map(|(truth, found)| {
-                let (a, b) = (seen(truth), seen(found));
+            let directions = directions.iter().cycle().skip(quantities.settling);
+            let errors = counted().zip(directions).map(|((truth, found), direction)| {
+                let (a, b) = (seen(truth, direction), seen(found, direction));
                 a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()
             });
             push("partial_attitude_deg", mean(errors));
@@ -83,11 +109,12 @@ impl Case<'_> {
                 scene.bias.iter().zip(&log.biases).map(|(a, b)| (a - b).norm().to_degrees());
             push("gyro_bias_deg_s", mean(errors));
         }
+        push("nis", mean(log.nis.iter().copied()));
         push("nees_attitude", mean(log.attitude_nees.iter().copied()));
         if quantities.bias && kind.has_bias() {
             push("nees_gyro_bias", mean(log.bias_nees.iter().copied()));
         }
-        let nanoseconds = log.seconds * 1e9 / scene.steps.len() as f64;
+        let nanoseconds = log.seconds * 1e9 / log.timed_steps as f64;
         trial.step_times.push(StepTime { case, filter, nanoseconds });
         Ok(())
     }
@@ -111,58 +138,78 @@ fn run_memoryless(trial: &mut Trial, case: &'static str, scene: &Scene) -> Resul
 }
 
 /// What a filter said on its way through a scene.
+#[derive(Debug, Default)]
 struct Log {
     attitudes: Vec<Rotation3<f64>>,
     biases: Vec<Vector3<f64>>,
     attitude_nees: Vec<f64>,
     bias_nees: Vec<f64>,
-    /// CPU time of propagation, update and the estimate of each step, s.
+    nis: Vec<f64>,
+    /// CPU time of propagation, update and the estimate of the timed steps, s.
     seconds: f64,
+    timed_steps: usize,
 }
 
 /// Steps between two readings of the clock, which itself takes time.
 const TIMED_BLOCK: usize = 64;
 
-fn follow(filter: &mut dyn BayesFilter, scene: &Scene) -> Result<Log, FilterError> {
+/// Runs a filter over a scene; an error comes with the number of the step.
+fn follow(filter: &mut dyn BayesFilter, scene: &Scene) -> Result<Log, (usize, FilterError)> {
     let count = scene.steps.len();
-    let mut log = Log {
-        attitudes: Vec::with_capacity(count),
-        biases: Vec::with_capacity(count),
-        attitude_nees: Vec::new(),
-        bias_nees: Vec::new(),
-        seconds: 0.0,
-    };
-    let instants = (count / 2 / CONSISTENCY_INSTANTS).max(TIMED_BLOCK);
-    let gaussian = filter.is_gaussian();
-    for start in (0..count).step_by(TIMED_BLOCK) {
-        let clock = ThreadTime::now();
-        let end = (start + TIMED_BLOCK).min(count);
-        for (step, measured) in scene.steps[start..end].iter().zip(&scene.measured[start..end]) {
-            filter.propagate(step)?;
-            match measured {
-                Some(Measured::Directions { fisher, gaussian: other }) => {
-                    filter.update_directions(if gaussian { other } else { fisher })?;
-                }
-                Some(Measured::Attitude { fisher, gaussian: other }) => {
-                    filter.update_attitude(if gaussian { other } else { fisher })?;
-                }
-                None => {}
-            }
-            log.attitudes.push(filter.attitude());
-            log.biases.push(filter.gyro_bias().unwrap_or_default());
+    let mut log = Log::default();
+    log.attitudes.reserve(count);
+    log.biases.reserve(count);
+    let interval = (count / 2 / CONSISTENCY_INSTANTS).max(TIMED_BLOCK);
+    let mut k = 0;
+    while k < count {
+        let (start, clock) = (k, ThreadTime::now());
+        while k < count.min(start + TIMED_BLOCK) {
+            log.advance(filter, scene, k, |_| ()).map_err(|error| (k, error))?;
+            k += 1;
         }
         log.seconds += clock.elapsed().as_secs_f64();
-        let due = end / instants > start / instants;
-        if end > count / 2 && due {
-            let last = end - 1;
-            log.record_consistency(filter, &scene.truth[last], &scene.bias[last]);
+        log.timed_steps += k - start;
+        if 2 * k > count && k / interval > start / interval {
+            log.record_errors(filter, &scene.truth[k - 1], &scene.bias[k - 1]);
+            let mut nis = None;
+            while k < count && nis.is_none() {
+                let observe = |filter: &dyn BayesFilter| {
+                    nis = scene.measured[k].as_ref().map(|measured| {
+                        let measured = measured.of(filter.is_gaussian());
+                        normalized_innovation(&filter.estimate(), measured)
+                    });
+                };
+                log.advance(filter, scene, k, observe).map_err(|error| (k, error))?;
+                k += 1;
+            }
+            log.nis.extend(nis.flatten());
         }
     }
     Ok(log)
 }
 
 impl Log {
-    fn record_consistency(
+    /// Step `k` of the scene; `before_update` sees the filter between propagation and update.
+    fn advance(
+        &mut self,
+        filter: &mut dyn BayesFilter,
+        scene: &Scene,
+        k: usize,
+        before_update: impl FnOnce(&dyn BayesFilter),
+    ) -> Result<(), FilterError> {
+        filter.propagate(&scene.steps[k])?;
+        before_update(&*filter);
+        match scene.measured[k].as_ref().map(|measured| measured.of(filter.is_gaussian())) {
+            Some(Modelled::Directions(vectors)) => filter.update_directions(vectors)?,
+            Some(Modelled::Attitude(attitude)) => filter.update_attitude(attitude)?,
+            None => {}
+        }
+        self.attitudes.push(filter.attitude());
+        self.biases.push(filter.gyro_bias().unwrap_or_default());
+        Ok(())
+    }
+
+    fn record_errors(
         &mut self,
         filter: &dyn BayesFilter,
         truth: &Rotation3<f64>,
@@ -175,11 +222,6 @@ impl Log {
             self.bias_nees.extend(normalized(&(found.mean - bias), &found.covariance));
         }
     }
-}
-
-/// `e^T P^-1 e`; none where `P` has no inverse.
-fn normalized(error: &Vector3<f64>, covariance: &Matrix3<f64>) -> Option<f64> {
-    covariance.cholesky().map(|factor| error.dot(&factor.solve(error)))
 }
 
 fn angle(a: &Rotation3<f64>, b: &Rotation3<f64>) -> f64 {
@@ -240,12 +282,14 @@ mod tests {
     #[test]
     fn observability_is_that_of_table_4_1() {
         let report = few("wang-4.2", 1);
-        for case in ["AVI_RVI", "AVB_RVB"] {
-            assert!(row(&report, case, "bf-mfd", "attitude_deg").mean < 15.0, "{case}");
-        }
+        let error = |case, quantity| row(&report, case, "bf-mfd", quantity).mean;
+        let observable = ["AVI_RVI", "AVB_RVB"].map(|case| error(case, "attitude_deg"));
+        assert!(observable.iter().all(|error| *error < 10.0), "{observable:?}");
         for case in ["AVI_RVB", "AVB_RVI"] {
-            assert!(row(&report, case, "bf-mfd", "attitude_deg").mean > 60.0, "{case}");
-            assert!(row(&report, case, "bf-mfd", "partial_attitude_deg").mean < 5.0, "{case}");
+            // About the direction any attitude is a mode, so that this error is as arbitrary as
+            // the one that is named.
+            assert!(error(case, "attitude_deg") > 20.0, "{case}");
+            assert!(error(case, "partial_attitude_deg") < 5.0, "{case}");
         }
     }
 }

@@ -25,6 +25,23 @@ impl Measured {
     pub fn attitude(measured: AttitudeMeasurement) -> Self {
         Self::Attitude { fisher: Box::new(measured), gaussian: Box::new(measured) }
     }
+
+    /// The measurement as the filters of one kind model it.
+    pub fn of(&self, is_gaussian: bool) -> Modelled<'_> {
+        match self {
+            Self::Directions { gaussian, .. } if is_gaussian => Modelled::Directions(gaussian),
+            Self::Directions { fisher, .. } => Modelled::Directions(fisher),
+            Self::Attitude { gaussian, .. } if is_gaussian => Modelled::Attitude(gaussian),
+            Self::Attitude { fisher, .. } => Modelled::Attitude(fisher),
+        }
+    }
+}
+
+/// A measurement with one model of its noise.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Modelled<'a> {
+    Directions(&'a [VectorMeasurement]),
+    Attitude(&'a AttitudeMeasurement),
 }
 
 /// One run: interval `k` leads to `truth[k]` and ends in `measured[k]`.
@@ -80,13 +97,14 @@ pub(super) struct GyroNoise {
     pub initial_bias: Vector3<f64>,
 }
 
-/// Drives a gyroscope along `motion` and measures after every `every` intervals.
+/// Drives a gyroscope along `motion`; after every `every` intervals `measure` gets the number of
+/// the interval, counted from zero, and the attitude at its end.
 pub(super) fn simulate<R: Rng>(
     motion: &Motion,
     noise: &GyroNoise,
     every: usize,
     rng: &mut R,
-    mut measure: impl FnMut(&Rotation3<f64>, &mut R) -> Measured,
+    mut measure: impl FnMut(usize, &Rotation3<f64>, &mut R) -> Measured,
 ) -> Scene {
     let h = motion.interval;
     let mut scene = Scene::default();
@@ -97,7 +115,7 @@ pub(super) fn simulate<R: Rng>(
         bias += normal(rng) * (noise.bias_walk * h.sqrt());
         scene.truth.push(*truth);
         scene.bias.push(bias);
-        scene.measured.push(((k + 1) % every == 0).then(|| measure(truth, rng)));
+        scene.measured.push(((k + 1) % every == 0).then(|| measure(k, truth, rng)));
     }
     scene
 }
@@ -114,15 +132,31 @@ pub(super) fn pendulum(interval: f64, count: usize, sampling: Sampling) -> Motio
     const MASS: f64 = 1.0;
     const ARM: f64 = 0.3;
     const GRAVITY: f64 = 9.81;
+    let torque = |r: &Rotation3<f64>| {
+        let gravity = r.inverse() * Vector3::z() * (MASS * GRAVITY);
+        (Vector3::z() * ARM).cross(&gravity)
+    };
+    rigid_body(INERTIA, torque, Vector3::repeat(4.14), interval, count, sampling)
+}
+
+/// A rigid body with these principal moments of inertia, kg m^2, under a torque in the body frame,
+/// N m, that depends on its attitude; it starts at the identity with the angular velocity `rate`,
+/// rad/s, in the body frame.
+pub(super) fn rigid_body(
+    inertia: [f64; 3],
+    torque: impl Fn(&Rotation3<f64>) -> Vector3<f64>,
+    rate: Vector3<f64>,
+    interval: f64,
+    count: usize,
+    sampling: Sampling,
+) -> Motion {
     /// Integration steps in each interval.
     const SUBSTEPS: usize = 20;
-    let inertia = Vector3::from(INERTIA);
+    let inertia = Vector3::from(inertia);
     let acceleration = |r: &Rotation3<f64>, w: &Vector3<f64>| {
-        let gravity = r.inverse() * Vector3::z() * (MASS * GRAVITY);
-        let torque = (Vector3::z() * ARM).cross(&gravity) - w.cross(&inertia.component_mul(w));
-        torque.component_div(&inertia)
+        (torque(r) - w.cross(&inertia.component_mul(w))).component_div(&inertia)
     };
-    let (mut r, mut w) = (Rotation3::identity(), Vector3::repeat(4.14));
+    let (mut r, mut w) = (Rotation3::identity(), rate);
     let h = interval / SUBSTEPS as f64;
     let (mut attitudes, mut samples) = (vec![r], Vec::new());
     for _ in 0..count {

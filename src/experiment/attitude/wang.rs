@@ -8,7 +8,7 @@ use rand_distr::Distribution;
 
 use super::super::{PaperValue, Report, Request, Study, StudyError, Trial, monte_carlo};
 use super::scene::{GyroNoise, Measured, Motion, normal, simulate, tumbling};
-use super::{Case, Quantities};
+use super::{AnyError, Case, Quantities};
 use crate::distribution::VonMisesFisher;
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
@@ -35,8 +35,6 @@ pub(super) const STUDIES: &[Study] = &[
         run: table_4_7,
     },
 ];
-
-type AnyError = Box<dyn std::error::Error + Send + Sync>;
 
 /// Gyroscope interval, s.
 const INTERVAL: f64 = 1.0 / 150.0;
@@ -67,6 +65,8 @@ fn coning(count: usize) -> Motion {
 fn table_4_2(request: &Request) -> Result<Report, StudyError> {
     use Frame::{Body, World};
     const CONCENTRATION: f64 = 200.0;
+    const KNOWN: Vector3<f64> = Vector3::new(1.0, 0.0, 0.0);
+    const FIXED: &[Vector3<f64>] = &[KNOWN];
     const CASES: [(&str, Frame, Frame); 4] = [
         ("AVI_RVI", World, World),
         ("AVI_RVB", World, Body),
@@ -97,11 +97,10 @@ fn table_4_2(request: &Request) -> Result<Report, StudyError> {
                 initial_bias: Vector3::zeros(),
             };
             let mut failure = None;
-            let mut scene = simulate(&motion, &noise, EVERY, rng, |truth, rng| {
-                let known = Vector3::x();
+            let mut scene = simulate(&motion, &noise, EVERY, rng, |_, truth, rng| {
                 let seen = match reference {
-                    World => truth.inverse() * known,
-                    Body => truth * known,
+                    World => truth.inverse() * KNOWN,
+                    Body => truth * KNOWN,
                 };
                 let noisy = VonMisesFisher::new(seen, CONCENTRATION).map(|d| d.sample(rng));
                 let noisy = noisy.unwrap_or_else(|error| {
@@ -109,8 +108,8 @@ fn table_4_2(request: &Request) -> Result<Report, StudyError> {
                     seen
                 });
                 Measured::directions(vec![match reference {
-                    World => VectorMeasurement::of_world_direction(known, noisy, CONCENTRATION),
-                    Body => VectorMeasurement::of_body_direction(known, noisy, CONCENTRATION),
+                    World => VectorMeasurement::of_world_direction(KNOWN, noisy, CONCENTRATION),
+                    Body => VectorMeasurement::of_body_direction(KNOWN, noisy, CONCENTRATION),
                 }])
             });
             if let Some(error) = failure {
@@ -124,7 +123,7 @@ fn table_4_2(request: &Request) -> Result<Report, StudyError> {
             let gyro = GyroModel { frame: rate, ..GyroModel::isotropic(GYRO_NOISE, 0.0) };
             let prior = AttitudePrior::matrix_fisher(&Matrix3::zeros())?;
             let quantities = Quantities {
-                partial: (rate != reference).then_some((reference, Vector3::x())),
+                partial: (rate != reference).then_some((reference, FIXED)),
                 ..Quantities::default()
             };
             let mut column = Case { label: case, gyro, prior, scene: &scene, quantities };
@@ -216,7 +215,7 @@ fn table_4_6(request: &Request) -> Result<Report, StudyError> {
                 bias_walk: BIAS_WALK,
                 initial_bias: Vector3::zeros(),
             };
-            let scene = simulate(&motion, &gyro_noise, EVERY, rng, |truth, rng| {
+            let scene = simulate(&motion, &gyro_noise, EVERY, rng, |_, truth, rng| {
                 let world_from_body = truth * error(rng);
                 Measured::Attitude {
                     fisher: Box::new(AttitudeMeasurement { world_from_body, noise }),
@@ -363,6 +362,8 @@ impl Direction {
 
 fn table_4_7(request: &Request) -> Result<Report, StudyError> {
     const STEPS: usize = 45_000;
+    const FIRST: Vector3<f64> = Vector3::new(0.0, 1.0, 0.0);
+    const FIXED: &[Vector3<f64>] = &[FIRST];
     let motion = tumbling(INTERVAL, STEPS);
     let trial = |rng: &mut ChaCha8Rng| -> Result<Trial, AnyError> {
         let mut trial = Trial::default();
@@ -382,15 +383,15 @@ fn table_4_7(request: &Request) -> Result<Report, StudyError> {
             initial_bias: Vector3::zeros(),
         };
         for row in &TABLE_4_7 {
-            let mut directions = vec![Direction::new(Vector3::y(), 0.01)?];
+            let mut directions = vec![Direction::new(FIRST, 0.01)?];
             if row.variance.is_finite() {
                 directions.push(Direction::new(Vector3::x(), row.variance)?);
             }
-            let scene = simulate(&motion, &gyro_noise, EVERY, rng, |truth, rng| {
+            let scene = simulate(&motion, &gyro_noise, EVERY, rng, |_, truth, rng| {
                 let (fisher, gaussian) = directions.iter().map(|d| d.measure(truth, rng)).unzip();
                 Measured::Directions { fisher, gaussian }
             });
-            let partial = row.partial.map(|_| (Frame::World, Vector3::y()));
+            let partial = row.partial.map(|_| (Frame::World, FIXED));
             let quantities = Quantities { partial, bias: true, settling: 0 };
             let label = row.case;
             Case { label, gyro, prior, scene: &scene, quantities }.run(&mut trial, &KINDS_4_7)?;
