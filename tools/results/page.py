@@ -121,6 +121,14 @@ def gnss(reports):
     return "<h2 id=\"gnss\">IMU-GNSS: KITTI drive</h2>" + table(columns, rows)
 
 
+def broad(reports):
+    """Orientation errors on the trials of BROAD beside those of the packages vqf and ahrs."""
+    columns = ["trial", "filter", "total, deg", "heading, deg", "inclination, deg"]
+    rows = [[r["trial"], r["filter"], r["total"], r["heading"], r["inclination"]]
+            for _, report in reports for r in report["rows"]]
+    return "<h2 id=\"broad\">BROAD: orientation RMSE</h2>" + table(columns, rows)
+
+
 def replay(reports):
     columns = ["log", "filter", "frames", "APE RMSE, m", "attitude RMSE, deg", "real-time factor"]
     rows = []
@@ -140,13 +148,13 @@ def main():
     parser.add_argument("--absent", nargs="*", default=[], help="data that were not found")
     parser.add_argument("files", nargs="*", type=Path)
     arguments = parser.parse_args()
-    by_kind = {"studies": [], "gnss": [], "replay": []}
+    by_kind = {"studies": [], "gnss": [], "broad": [], "replay": []}
     for file in sorted(arguments.files):
         by_kind[file.parent.name].append((file.stem, json.loads(file.read_text())))
 
     sections = [study(report) for _, report in by_kind["studies"]]
     links = [report["name"] for _, report in by_kind["studies"]]
-    for kind, section in (("gnss", gnss), ("replay", replay)):
+    for kind, section in (("gnss", gnss), ("broad", broad), ("replay", replay)):
         if by_kind[kind]:
             sections.append(section(by_kind[kind]))
             links.append(kind)
