@@ -83,8 +83,8 @@ fn mip(ratio: f32, coarsest: usize) -> (usize, f32) {
     let fine = (bits >> 23) as usize - 127;
     // Blending only halfway between levels saves half of the second look-ups unseen.
     let blend = (2.0 * (bits & 0x7f_ffff) as f32 / 8_388_608.0 - 0.5).clamp(0.0, 1.0);
-    let level = if blend == 1.0 { fine + 1 } else { fine };
-    if level >= coarsest { (coarsest, 0.0) } else { (level, blend % 1.0) }
+    let (level, blend) = if blend == 1.0 { (fine + 1, 0.0) } else { (fine, blend) };
+    if level >= coarsest { (coarsest, 0.0) } else { (level, blend) }
 }
 
 impl Texture {
@@ -95,7 +95,8 @@ impl Texture {
         const MAX_RATIO: f32 = 4.0;
         let length = |e: [f32; 2]| (e[0] * e[0] + e[1] * e[1]).sqrt();
         let (lx, ly) = (length(dx), length(dy));
-        let (long, axis, short) = if lx > ly { (lx, dx, ly) } else { (ly, dy, lx) };
+        let (long, short) = (lx.max(ly), lx.min(ly));
+        let axis = if lx > ly { dx } else { dy };
         let width = short.max(long / MAX_RATIO).max(1e-6);
         // Bilinear kernels overlap: three samples cover a footprint four times as long as wide.
         let samples = ((0.75 * long / width + 0.5) as usize).max(1);

@@ -177,11 +177,13 @@ impl Solid {
         // The footprint of a pixel on the face: its edges, carried along the face's plane.
         let along = direction[axis];
         let along = if along.abs() < 1e-6 { 1e-6_f32.copysign(along) } else { along };
-        let [dx, dy] = [0, 1].map(|side| {
+        let mut edges = [[0.0; 2]; 2];
+        for (side, edge) in edges.iter_mut().enumerate() {
             let e = view.axes.column(side) * (SPOT * pixel[side] * hit.distance);
             let slide = e[axis] / along;
-            [e[u] - direction[u] * slide, e[v] - direction[v] * slide]
-        });
+            *edge = [e[u] - direction[u] * slide, e[v] - direction[v] * slide];
+        }
+        let [dx, dy] = edges;
         let (s, t) = (point[u] + self.half[u], point[v] + self.half[v]);
         let face = &self.faces[hit.face];
         let base = face.texture.sample(s, t, dx, dy);
