@@ -28,7 +28,7 @@ pub struct RotationRegression<const N: usize> {
 
 /// A measurement of three consecutive components of `x`, linear in `r`, and of `r` itself:
 /// `-2 log L = y^T information y - 2 vector^T y`, `y = (r, x[first..first + 3])`.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct JointInformation {
     pub rr: SMatrix<f64, 9, 9>,
     pub rx: SMatrix<f64, 9, 3>,

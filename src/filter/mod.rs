@@ -13,6 +13,7 @@ pub use bayes::{
 };
 pub use visual::{
     Calibration, Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude, MapTreatment,
-    Mekf, MfgFilter, PointState, Screening, SeenPoint, SlamFilter, UpdateMethod, UpdateOutcome,
-    VisualInertialFilter, calibration_block, choose_points, point_by_pose, pose_covariance,
+    Mekf, MfgFilter, PointState, Rest, Screening, SeenPoint, SlamFilter, UpdateMethod,
+    UpdateOutcome, VisualInertialFilter, calibration_block, choose_points, point_by_pose,
+    pose_covariance,
 };

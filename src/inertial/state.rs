@@ -1,4 +1,4 @@
-use nalgebra::{Isometry3, SMatrix, Vector3};
+use nalgebra::{Isometry3, SMatrix, SVector, UnitQuaternion, Vector3};
 
 use crate::distribution::matrix_fisher::MatrixFisher;
 
@@ -29,6 +29,23 @@ pub struct NavState {
 }
 
 impl NavState {
+    /// The state whose error, in the coordinates of [`NavCovariance`], this one had.
+    pub fn corrected_by(&self, error: &SVector<f64, 15>) -> Self {
+        let part = |start: usize| error.fixed_rows::<3>(start).into_owned();
+        let turn = UnitQuaternion::from_scaled_axis(part(block::ROTATION));
+        let rotation = self.world_from_body.rotation * turn;
+        let position = self.world_from_body.translation.vector + part(block::POSITION);
+        Self {
+            world_from_body: Isometry3::from_parts(
+                position.into(),
+                UnitQuaternion::new_normalize(rotation.into_inner()),
+            ),
+            velocity: self.velocity + part(block::VELOCITY),
+            gyro_bias: self.gyro_bias + part(block::GYRO_BIAS),
+            accel_bias: self.accel_bias + part(block::ACCEL_BIAS),
+        }
+    }
+
     pub fn is_finite(&self) -> bool {
         let pose = &self.world_from_body;
         let vectors = [pose.translation.vector, self.velocity, self.gyro_bias, self.accel_bias];
@@ -65,7 +82,7 @@ impl Belief {
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
-    use nalgebra::{Matrix3, UnitQuaternion};
+    use nalgebra::Matrix3;
 
     use super::*;
 

@@ -3,10 +3,11 @@
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, SMatrix, SVector, UnitQuaternion, Vector3};
 
+use super::Rest;
 use crate::alignment::{MapEstimate, PointPair, PoseInformation, RobustKernel};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::distribution::progressive::{ProgressiveConfig, progressive_update};
-use crate::distribution::regression::RotationRegression;
+use crate::distribution::regression::{JointInformation, RotationRegression};
 use crate::distribution::rotation_quadratic::{
     RotationMoments, RotationQuadratic, rotated_vector_by_rotation,
 };
@@ -236,6 +237,23 @@ impl BroadBelief {
         let attitude = progressive_update(&self.attitude, log_likelihood, &config).ok()?;
         density.attitude = RotationQuadratic::matrix_fisher(&attitude.parameter());
         Some(Self::new(attitude, shifted(density, origin)))
+    }
+
+    /// Conditions the belief on rest, exactly.
+    pub fn condition_on_rest(&self, rest: &Rest) -> Option<BroadUpdate> {
+        let measured = |mean: Vector3<f64>, sd: f64| JointInformation {
+            xx: Matrix3::identity() / sd.powi(2),
+            eta_x: mean / sd.powi(2),
+            ..JointInformation::default()
+        };
+        let mut density = self
+            .density
+            .conditioned(VELOCITY, &measured(Vector3::zeros(), rest.velocity_sd))?
+            .conditioned(BIASES, &measured(rest.rate, rest.rate_sd))?;
+        density.attitude = density.attitude.reduced();
+        let (mode, curvature) = density.attitude.global_mode()?;
+        let least_information = curvature.symmetric_eigenvalues().min();
+        Some(BroadUpdate { density, mode, least_information, points: 0 })
     }
 
     /// Information about the rotation axis that is known least, 1/rad^2.

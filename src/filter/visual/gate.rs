@@ -25,11 +25,10 @@ pub struct Gate {
 
 impl Gate {
     pub fn new(config: &FilterConfig) -> Self {
-        let probability = config.gate_probability;
-        let threshold = (probability > 0.0 && probability < 1.0)
-            .then(|| ChiSquared::new(DEGREES_OF_FREEDOM).ok())
-            .flatten()
-            .map_or(f64::INFINITY, |distribution| distribution.inverse_cdf(probability));
+        let distribution = ChiSquared::new(DEGREES_OF_FREEDOM).ok();
+        let threshold = distribution
+            .filter(|_| config.has_gate())
+            .map_or(f64::INFINITY, |chi_squared| chi_squared.inverse_cdf(config.gate_probability));
         Self { threshold, accepted: Vec::new(), passed: Vec::new() }
     }
 
@@ -41,36 +40,36 @@ impl Gate {
         world_from_body: &Rotation3<f64>,
         predicted: impl Fn(&PointPair) -> MapEstimate,
     ) -> Screening {
-        let mut largest: f64 = 0.0;
-        self.accepted.clear();
-        self.passed.clear();
-        for pair in pairs {
+        let distance = |pair: &PointPair| {
             let seen = predicted(pair);
             let map =
                 PointPair { world_covariance: pair.world_covariance + seen.covariance, ..*pair };
             // A pair without a positive definite covariance is refused by the update anyway.
             let weight = map.weight(world_from_body.matrix()).unwrap_or_else(Matrix3::zeros);
             let innovation = pair.in_world - seen.position;
-            let distance = innovation.dot(&(weight * innovation));
-            largest = largest.max(distance);
-            let passes = distance <= self.threshold;
-            self.passed.push(passes);
-            if passes {
-                self.accepted.push(*pair);
-            }
-        }
-        let mut screening = Screening {
-            largest,
-            threshold: self.threshold,
-            rejected: pairs.len() - self.accepted.len(),
+            innovation.dot(&(weight * innovation))
         };
-        if 2 * self.accepted.len() < pairs.len() {
-            self.accepted.clear();
-            self.accepted.extend_from_slice(pairs);
-            self.passed.fill(true);
-            screening = Screening { threshold: f64::INFINITY, rejected: 0, ..screening };
-        }
+        let screening = self.judge(pairs.iter().map(distance));
+        let passed = pairs.iter().zip(&self.passed).filter(|(_, passed)| **passed);
+        self.accepted.clear();
+        self.accepted.extend(passed.map(|(pair, _)| *pair));
         screening
+    }
+
+    /// Says of points at these squared Mahalanobis distances from their predictions which pass.
+    pub fn judge(&mut self, distances: impl Iterator<Item = f64>) -> Screening {
+        let mut largest: f64 = 0.0;
+        self.passed.clear();
+        for distance in distances {
+            largest = largest.max(distance);
+            self.passed.push(distance <= self.threshold);
+        }
+        let rejected = self.passed.iter().filter(|passed| !**passed).count();
+        if 2 * rejected > self.passed.len() {
+            self.passed.fill(true);
+            return Screening { largest, threshold: f64::INFINITY, rejected: 0 };
+        }
+        Screening { largest, threshold: self.threshold, rejected }
     }
 
     /// For each pair last offered whether it passed.
@@ -108,10 +107,10 @@ mod tests {
     #[test]
     fn improbable_points_stay_out() {
         let mut gate = Gate::new(&FilterConfig::default());
-        // Variance 0.04, distance 1 is 25 = 5 standard deviations squared.
-        let found = screen(&mut gate, &[pair(0.1), pair(-0.2), pair(1.0)]);
+        // Variance 0.04, distance 1.2 is 36 = 6 standard deviations squared.
+        let found = screen(&mut gate, &[pair(0.1), pair(-0.2), pair(1.2)]);
         assert_eq!((found.rejected, gate.accepted().len()), (1, 2));
-        assert!((found.largest - 25.0).abs() < 1e-9 && (found.threshold - 21.1).abs() < 0.1);
+        assert!((found.largest - 36.0).abs() < 1e-9 && (found.threshold - 30.7).abs() < 0.1);
     }
 
     #[test]

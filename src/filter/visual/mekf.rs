@@ -1,10 +1,10 @@
 //! The multiplicative extended Kalman filter: the Gaussian rival of the MFG filters.
 
-use nalgebra::{Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
+use nalgebra::{Matrix6, SMatrix, SVector};
 
 use super::gate::Gate;
 use super::{
-    FilterConfig, UpdateOutcome, VisualInertialFilter, normalized_innovation, world_point,
+    FilterConfig, Rest, UpdateOutcome, VisualInertialFilter, normalized_innovation, world_point,
 };
 use crate::alignment::{PointPair, PoseInformation};
 use crate::inertial::{Belief, ImuSample, Propagator, block, symmetrize};
@@ -25,8 +25,7 @@ impl Mekf {
     }
 
     fn corrected(&self, information: &PoseInformation) -> Option<Belief> {
-        let mut state = self.belief.state;
-        let rotation = state.world_from_body.rotation.to_rotation_matrix();
+        let rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
         let (lambda, vector) = information.linearized(&rotation);
 
         // Information form of the gain, so that the cost does not depend on the number of points
@@ -40,15 +39,7 @@ impl Mekf {
         let correction: SVector<f64, 15> = by_pose * (inner * vector);
         let mut covariance = prior - by_pose * (inner * lambda) * by_pose.transpose();
         symmetrize(&mut covariance);
-
-        let part = |start: usize| correction.fixed_rows::<3>(start).into_owned();
-        let turn: Vector3<f64> = part(block::ROTATION);
-        let turned = state.world_from_body.rotation * UnitQuaternion::from_scaled_axis(turn);
-        state.world_from_body.rotation = UnitQuaternion::new_normalize(turned.into_inner());
-        state.world_from_body.translation.vector += part(block::POSITION);
-        state.velocity += part(block::VELOCITY);
-        state.gyro_bias += part(block::GYRO_BIAS);
-        state.accel_bias += part(block::ACCEL_BIAS);
+        let state = self.belief.state.corrected_by(&correction);
         Some(Belief { state, covariance })
     }
 }
@@ -86,6 +77,10 @@ impl VisualInertialFilter for Mekf {
         let innovation = normalized_innovation(&information, &self.belief)?;
         self.belief = self.corrected(&information).filter(Belief::is_finite)?;
         Some(UpdateOutcome { innovation, points: information.points, screening })
+    }
+
+    fn rest(&mut self, rest: &Rest) -> bool {
+        rest.condition(&mut self.belief)
     }
 
     fn passed(&self) -> &[bool] {

@@ -3,11 +3,11 @@
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use super::broad::{
-    BroadBelief, EUCLIDEAN, NavRegression, POSITION, assemble, nav_state, of_belief,
+    BroadBelief, BroadUpdate, EUCLIDEAN, NavRegression, POSITION, assemble, nav_state, of_belief,
 };
 use super::gate::Gate;
 use super::{
-    FilterConfig, UpdateMethod, UpdateOutcome, VisualInertialFilter, normalized_innovation,
+    FilterConfig, Rest, UpdateMethod, UpdateOutcome, VisualInertialFilter, normalized_innovation,
     world_point,
 };
 use crate::alignment::{
@@ -87,6 +87,11 @@ impl MfgFilter {
         let pairs = self.gate.accepted();
         let update = broad.update(pairs, self.config.kernel(), self.config.relinearizations)?;
         let points = update.points;
+        self.accept_broad(update)?;
+        Some(points)
+    }
+
+    fn accept_broad(&mut self, update: BroadUpdate) -> Option<()> {
         if update.least_information > CONCENTRATED {
             let belief = concentrate(&update.density, &update.mode, &Vector3::zeros())?;
             self.belief = Some(belief).filter(Belief::is_finite)?;
@@ -96,7 +101,7 @@ impl MfgFilter {
             self.belief = Some(broad.summary()).filter(Belief::is_finite)?;
             self.broad = Some(Box::new(broad));
         }
-        Some(points)
+        Some(())
     }
 
     fn update_by_sigma_points(&mut self, information: &PoseInformation) -> Option<usize> {
@@ -190,6 +195,16 @@ impl VisualInertialFilter for MfgFilter {
             (UpdateMethod::Exact, None) => self.update_concentrated(information)?,
         };
         Some(UpdateOutcome { innovation, points, screening })
+    }
+
+    fn rest(&mut self, rest: &Rest) -> bool {
+        match &self.broad {
+            Some(broad) => {
+                let update = broad.condition_on_rest(rest);
+                update.and_then(|update| self.accept_broad(update)).is_some()
+            }
+            None => rest.condition(&mut self.belief),
+        }
     }
 
     fn passed(&self) -> &[bool] {

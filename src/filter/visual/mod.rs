@@ -7,6 +7,7 @@ mod gravity;
 mod mekf;
 mod mfg;
 mod regression;
+mod rest;
 mod selection;
 mod slam;
 
@@ -25,6 +26,7 @@ pub use calibration::{Calibration, calibration_block};
 pub use mekf::Mekf;
 pub use mfg::MfgFilter;
 pub use regression::Coordinates;
+pub use rest::Rest;
 pub use selection::{Candidate, choose_points};
 pub use slam::SlamFilter;
 
@@ -246,7 +248,7 @@ impl Default for FilterConfig {
     fn default() -> Self {
         Self {
             huber: 2.0,
-            gate_probability: 0.9999,
+            gate_probability: 0.999_999,
             update_method: UpdateMethod::Exact,
             relinearizations: 2,
             measurement_inflation: 1.0,
@@ -270,6 +272,11 @@ impl Default for FilterConfig {
 }
 
 impl FilterConfig {
+    /// Whether improbable points are left out.
+    pub fn has_gate(&self) -> bool {
+        self.gate_probability > 0.0 && self.gate_probability < 1.0
+    }
+
     pub(super) fn kernel(&self) -> RobustKernel {
         if self.huber > 0.0 {
             RobustKernel::Huber { scale: self.huber }
@@ -321,6 +328,10 @@ pub trait VisualInertialFilter: Send {
     /// Conditions the belief on matched points. `None`, and no change, without points or if no
     /// finite belief follows from them.
     fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome>;
+
+    /// Conditions the belief on the body standing still. False, and no change, if no finite belief
+    /// follows.
+    fn rest(&mut self, rest: &Rest) -> bool;
 
     /// For each pair offered to the last update whether it passed the gate.
     fn passed(&self) -> &[bool];

@@ -83,15 +83,6 @@ pub(super) struct Posterior {
     pub covariance: DMatrix<f64>,
 }
 
-/// How well measurements fitted what was known before them.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Fit {
-    /// Squared normalised innovation per degree of freedom.
-    pub innovation: f64,
-    /// Largest squared Mahalanobis distance of a single point.
-    pub largest: f64,
-}
-
 impl<'a> Regression<'a> {
     /// Of a concentrated belief: the mode of the rotation, the means of the blocks of three of
     /// the Euclidean part (from `calibration` on, where given, those of the camera's calibration),
@@ -159,23 +150,32 @@ impl<'a> Regression<'a> {
         self.calibration.into_iter().flat_map(move |first| (first..).zip(derivatives))
     }
 
+    /// Squared Mahalanobis distance of each measurement from what is expected of it.
+    pub fn squared_distances(&self, measurements: &[Measurement]) -> Option<Vec<f64>> {
+        let at_prior = self.coordinates.at_prior();
+        let derivative = self.coordinates.derivative(self.prior);
+        measurements
+            .iter()
+            .map(|m| Some(self.noise(m, self.prior, 0.0, &at_prior, &derivative)?.1))
+            .collect()
+    }
+
     /// Bayes' rule. Covariances are
     /// turned to the world by `weighted_at`, and inflated so that weights fall by Huber's law
-    /// beyond a Mahalanobis distance of `huber` (0: never).
+    /// beyond a Mahalanobis distance of `huber` (0: never). Gives the squared normalised
+    /// innovation per degree of freedom.
     pub fn condition(
         &mut self,
         measurements: &[Measurement],
         weighted_at: &Rotation3<f64>,
         huber: f64,
-    ) -> Option<Fit> {
+    ) -> Option<f64> {
         let at_prior = self.coordinates.at_prior();
         let derivative = self.coordinates.derivative(self.prior);
-        let (noises, distances): (Vec<_>, Vec<_>) = measurements
+        let noises: Vec<_> = measurements
             .iter()
-            .map(|m| self.noise(m, weighted_at, huber, &at_prior, &derivative))
-            .collect::<Option<Vec<_>>>()?
-            .into_iter()
-            .unzip();
+            .map(|m| Some(self.noise(m, weighted_at, huber, &at_prior, &derivative)?.0))
+            .collect::<Option<_>>()?;
         for (batch, noises) in measurements.chunks(BATCH).zip(noises.chunks(BATCH)) {
             self.condition_batch(batch, noises)?;
         }
@@ -186,8 +186,7 @@ impl<'a> Regression<'a> {
         let information = self.rotation_information + information.fixed_view::<3, 3>(0, 0);
         let explained = information.cholesky()?.solve(&gradient.fixed_view::<3, 1>(0, 0));
         let explained = gradient.fixed_view::<3, 1>(0, 0).dot(&explained);
-        let innovation = (total - explained).max(0.0) / (3.0 * measurements.len() as f64);
-        Some(Fit { innovation, largest: distances.into_iter().fold(0.0, f64::max) })
+        Some((total - explained).max(0.0) / (3.0 * measurements.len() as f64))
     }
 
     /// Covariance of a measurement in world coordinates, as robust weighting leaves it, and its

@@ -1,15 +1,15 @@
 //! Filters that keep map points in the state, with all correlations (`mfgs`, `mekfs`).
 
-use nalgebra::{DMatrix, Dyn, Matrix3, OMatrix, Point3, U3, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, DVector, Dyn, Matrix3, OMatrix, Point3, U3, UnitQuaternion, Vector3};
 
 use super::calibration::{BodyMotion, Calibration};
+use super::gate::Gate;
 use super::gravity::UnknownGravity;
 use super::regression::{
-    CALIBRATION_BLOCKS, Coordinates, Fit, Measurement, Posterior, Regression, Target,
+    CALIBRATION_BLOCKS, Coordinates, Measurement, Posterior, Regression, Target,
 };
 use super::{
-    FilterConfig, PointState, Screening, SeenPoint, UpdateOutcome, VisualInertialFilter,
-    point_by_pose,
+    FilterConfig, PointState, Rest, SeenPoint, UpdateOutcome, VisualInertialFilter, point_by_pose,
 };
 use crate::alignment::{MapEstimate, PointPair};
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block};
@@ -63,7 +63,8 @@ pub struct SlamFilter {
     measured_rate: Vector3<f64>,
     /// Whether the heading is that of an arbitrary world: uniform, and independent of all else.
     heading_is_free: bool,
-    /// For each point of the last update that it entered: the robust kernel weighs them all.
+    gate: Gate,
+    /// For each point offered to the last update whether it passed the gate.
     passed: Vec<bool>,
     /// Turn of the world since it was last asked for.
     world_turn: Option<UnitQuaternion<f64>>,
@@ -89,6 +90,7 @@ impl SlamFilter {
             calibration: None,
             measured_rate: Vector3::zeros(),
             heading_is_free: false,
+            gate: Gate::new(config),
             passed: Vec::new(),
             world_turn: None,
         }
@@ -183,37 +185,38 @@ impl SlamFilter {
         let prior = self.belief.state.world_from_body.rotation.to_rotation_matrix();
         let means = self.euclidean();
         let calibration = self.calibration.map(|_| self.after_gravity() / 3 - 1);
+        let of_prior = || {
+            let covariance = &self.covariance;
+            Regression::of_prior(self.coordinates, &prior, &means, calibration, covariance)
+        };
+        let mut regression = of_prior()?;
+        let screening = self.gate.judge(regression.squared_distances(measurements)?.into_iter());
+        let passed = measurements.iter().zip(self.gate.passed()).filter(|(_, passed)| **passed);
+        let accepted: Vec<_> = passed.map(|(measurement, _)| *measurement).collect();
         let mut weighted_at = prior;
-        let mut posterior: Option<(Posterior, Fit)> = None;
-        for _ in 0..=self.config.relinearizations {
-            let mut regression = Regression::of_prior(
-                self.coordinates,
-                &prior,
-                &means,
-                calibration,
-                &self.covariance,
-            )?;
-            let fit = regression.condition(measurements, &weighted_at, self.config.huber)?;
-            let found = regression.posterior()?;
-            let turned = so3::log(&weighted_at.rotation_to(&found.mode)).norm();
-            weighted_at = found.mode;
-            let fit = posterior.map_or(fit, |(_, first)| first);
-            posterior = Some((found, fit));
-            if turned < RELINEARIZE_ABOVE {
-                break;
+        let mut renewals = self.config.relinearizations;
+        let mut first = None;
+        let posterior = loop {
+            let found = regression.condition(&accepted, &weighted_at, self.config.huber)?;
+            first.get_or_insert(found);
+            let posterior = regression.posterior()?;
+            let turned = so3::log(&weighted_at.rotation_to(&posterior.mode)).norm();
+            if turned < RELINEARIZE_ABOVE || renewals == 0 {
+                break posterior;
             }
-        }
-        let (posterior, fit) = posterior?;
+            renewals -= 1;
+            weighted_at = posterior.mode;
+            regression = of_prior()?;
+        };
+        let innovation = first?;
         let turn = so3::log(&(prior.inverse() * posterior.mode));
-        let explained = 3.0 * measurements.len() as f64 * fit.innovation;
+        let explained = 3.0 * accepted.len() as f64 * innovation;
         if self.turn_distance(&turn)? > MOST_TURN * explained.max(NOISE_TURN) {
             return None;
         }
         self.accept(posterior)?;
         self.settle_gravity();
-        let screening = Screening { largest: fit.largest, threshold: f64::INFINITY, rejected: 0 };
-        self.passed = vec![true; measurements.len()];
-        Some(UpdateOutcome { innovation: fit.innovation, points: measurements.len(), screening })
+        Some(UpdateOutcome { innovation, points: accepted.len(), screening })
     }
 
     /// Squared Mahalanobis distance of a turn of the body from the belief.
@@ -342,19 +345,21 @@ impl SlamFilter {
         let variance = direction.dot(&by_magnitude.fixed_rows::<3>(NAVIGATION))
             + gravity.magnitude_sd().powi(2);
         self.covariance.ger(-1.0 / variance, &by_magnitude, &by_magnitude, 1.0);
-        let change = by_magnitude * (error / variance);
+        self.shift(&(by_magnitude * (error / variance)));
+    }
+
+    /// Moves the means of navigation part, points and calibration by a change of the whole state;
+    /// the covariance is that after it.
+    fn shift(&mut self, change: &DVector<f64>) {
         let part = |start: usize| change.fixed_rows::<3>(start).into_owned();
-        let state = &mut self.belief.state;
-        let turned = state.world_from_body.rotation
-            * UnitQuaternion::from_scaled_axis(part(block::ROTATION));
-        state.world_from_body.rotation = UnitQuaternion::new_normalize(turned.into_inner());
-        state.world_from_body.translation.vector += part(block::POSITION);
-        state.velocity += part(block::VELOCITY);
-        state.gyro_bias += part(block::GYRO_BIAS);
-        state.accel_bias += part(block::ACCEL_BIAS);
+        let navigation = change.fixed_rows::<NAVIGATION>(0).into_owned();
+        let before = self.belief.state.world_from_body;
+        self.belief.state = self.belief.state.corrected_by(&navigation);
+        let correction = self.belief.state.world_from_body * before.inverse();
         let base = self.base();
         for (slot, point) in self.points.iter_mut().enumerate() {
             point.position += part(base + 3 * slot);
+            point.entered_at = correction * point.entered_at;
         }
         let row = self.calibration_rows().start;
         if let Some(calibration) = &mut self.calibration {
@@ -363,6 +368,31 @@ impl SlamFilter {
             *calibration = calibration.moved(moved);
             calibration.covariance = self.covariance.fixed_view::<7, 7>(row, row).into_owned();
         }
+    }
+
+    /// The Kalman filter's update, to first order in the rotation.
+    fn condition_on_rest(&mut self, rest: &Rest) -> Option<()> {
+        self.synchronize();
+        let (residual, by_state, noise) = rest.linearized(&self.belief.state);
+        let by_measurement = self.covariance.columns(0, NAVIGATION) * by_state.transpose();
+        let spread = by_state * by_measurement.fixed_rows::<NAVIGATION>(0) + noise;
+        let factor = spread.cholesky()?;
+        let whitened = by_measurement * factor.l().try_inverse()?.transpose();
+        let change = &whitened * factor.l().solve_lower_triangular(&residual)?;
+        if !change.iter().chain(whitened.iter()).all(|x| x.is_finite()) {
+            return None;
+        }
+        self.covariance.gemm(-1.0, &whitened, &whitened.transpose(), 1.0);
+        self.belief.covariance =
+            self.covariance.fixed_view::<NAVIGATION, NAVIGATION>(0, 0).into_owned();
+        self.shift(&change);
+        if let Some(gravity) = &mut self.gravity {
+            gravity.mean += change.fixed_rows::<3>(NAVIGATION);
+            gravity.follow(&self.covariance);
+            self.propagator.set_gravity(gravity.mean);
+        }
+        self.settle_gravity();
+        Some(())
     }
 
     /// Gravity becomes `(0, 0, -g)`, and its error a turn of everything in the world.
@@ -458,7 +488,13 @@ impl VisualInertialFilter for SlamFilter {
                 }
             })
             .collect();
-        self.condition(&measurements)
+        let outcome = self.condition(&measurements)?;
+        self.passed = self.gate.passed().to_vec();
+        Some(outcome)
+    }
+
+    fn rest(&mut self, rest: &Rest) -> bool {
+        self.condition_on_rest(rest).is_some()
     }
 
     fn passed(&self) -> &[bool] {
@@ -546,7 +582,12 @@ impl PointState for SlamFilter {
             })
         };
         let measurements: Vec<_> = seen.iter().filter_map(measurement).collect();
-        self.condition(&measurements)
+        let outcome = self.condition(&measurements)?;
+        let mut judged = self.gate.passed().iter();
+        let passes =
+            |point: &SeenPoint| self.slot(point.id).is_none() || judged.next() == Some(&true);
+        self.passed = seen.iter().map(passes).collect();
+        Some(outcome)
     }
 
     /// The point's error is exactly that of the pose, moved to the point, that of the calibration
