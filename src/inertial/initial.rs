@@ -16,6 +16,14 @@ pub struct StandstillConfig {
     pub max_accel_deviation: f64,
     /// Largest magnitude of the mean angular velocity (what a bias may explain), rad/s.
     pub max_gyro_mean: f64,
+    /// Use rest in the course of a run as a measurement of velocity and gyro bias.
+    pub update: bool,
+    /// Largest speed at which the features seem to move at rest, m/s.
+    pub max_feature_speed: f64,
+    /// Standard deviation of each component of the velocity at rest, m/s.
+    pub velocity_sd: f64,
+    /// Standard deviation of the angular velocity at rest, averaged over a frame, rad/s.
+    pub rate_sd: f64,
 }
 
 impl Default for StandstillConfig {
@@ -25,6 +33,10 @@ impl Default for StandstillConfig {
             max_gyro_deviation: 0.015,
             max_accel_deviation: 0.1,
             max_gyro_mean: 0.05,
+            update: true,
+            max_feature_speed: 0.01,
+            velocity_sd: 0.02,
+            rate_sd: 0.01,
         }
     }
 }
@@ -72,6 +84,24 @@ impl StandstillCheck {
         self.gyro_deviation <= config.max_gyro_deviation
             && self.accel_deviation <= config.max_accel_deviation
             && self.gyro_mean.norm() <= config.max_gyro_mean
+    }
+
+    /// Statistic of the generalised likelihood ratio test for rest (Skog, Handel, Nilsson and
+    /// Rantakokko, IEEE Trans. Biomed. Eng. 57, 2010, (11)): mean squared deviation from a
+    /// constant force of the magnitude of `gravity` (m/s^2) and from a rate of zero, each in
+    /// units of its limit. Biases (rad/s, m/s^2) are taken off first. Up to about 1 at rest.
+    pub fn likelihood_ratio(
+        &self,
+        gyro_bias: &Vector3<f64>,
+        accel_bias: &Vector3<f64>,
+        gravity: f64,
+        config: &StandstillConfig,
+    ) -> f64 {
+        // The deviation about a constant splits into that about the mean and the mean's own.
+        let rate = self.gyro_deviation.powi(2) + (self.gyro_mean - gyro_bias).norm_squared();
+        let excess = (self.accel_mean - accel_bias).norm() - gravity;
+        let force = self.accel_deviation.powi(2) + excess.powi(2);
+        rate / config.max_gyro_deviation.powi(2) + force / config.max_accel_deviation.powi(2)
     }
 
     /// One line that holds every measured value against its threshold.
@@ -169,6 +199,17 @@ mod tests {
         assert!(!check.stands_still(&config));
         assert!(check.explain(&config).contains("too large"), "{}", check.explain(&config));
         assert!(StandstillCheck::measure(&rest[..1]).is_none());
+
+        let ratio = |samples: &[ImuSample], bias: f64| {
+            let check = StandstillCheck::measure(samples).unwrap();
+            let bias = Vector3::new(bias, 0.0, 0.0);
+            check.likelihood_ratio(&bias, &Vector3::zeros(), 9.81, &config)
+        };
+        assert!(ratio(&rest, 0.01) < 1e-9);
+        // A rate of 0.01 against a limit of 0.015 rad/s, squared.
+        assert_relative_eq!(ratio(&rest, 0.0), 4.0 / 9.0, epsilon = 1e-9);
+        // A sine of amplitude 1 has the variance 1/2; its limit is 0.1 m/s^2.
+        assert!(ratio(&shaken, 0.0) > 40.0);
     }
 
     #[test]

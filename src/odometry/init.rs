@@ -119,6 +119,11 @@ pub struct Initializer {
 }
 
 impl Initializer {
+    /// The same for a new start in the course of a run.
+    pub fn anew(&self) -> Self {
+        Self { init: InitConfig { mode: InitMode::Auto, ..self.init.clone() }, ..self.clone() }
+    }
+
     pub fn attempt(&self, evidence: &Evidence) -> Attempt {
         match self.init.mode {
             InitMode::Truth => self.with_truth(evidence),

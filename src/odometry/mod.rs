@@ -5,9 +5,12 @@ mod health;
 mod init;
 mod pipeline;
 mod report;
+mod rest;
+mod restart;
 mod runner;
 mod state_points;
 mod truth;
+mod watch;
 
 use serde::{Deserialize, Serialize};
 

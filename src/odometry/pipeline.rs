@@ -3,16 +3,19 @@ use std::time::Instant;
 
 use nalgebra::{Isometry3, Matrix2, Matrix3, Point2, Point3, UnitQuaternion, Vector2, Vector3};
 
-use super::health::{Health, HealthSummary};
+use super::health::{Divergence, Health, HealthSummary, Sight};
 use super::init::{Attempt, Evidence, Initializer};
 use super::report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
+use super::rest::RestDetector;
+use super::restart::Legacy;
 use super::truth::TruthTrack;
+use super::watch::{Agreement, SensorWatch};
 use super::{OdometryConfig, TruthPose, renew_state_points};
 use crate::alignment::PointPair;
 use crate::filter::{
-    Calibration, FilterKind, KnownAttitude, MapTreatment, SeenPoint, UpdateOutcome,
+    Calibration, FilterKind, KnownAttitude, MapTreatment, PointState, SeenPoint, UpdateOutcome,
     VisualInertialFilter, point_by_pose,
 };
 use crate::inertial::{Belief, ImuSample, Propagator, Stamp};
@@ -50,6 +53,15 @@ pub struct Odometry {
     frames_in: u64,
     now: Option<Stamp>,
     running: Option<Running>,
+    /// What the estimate that is to be started anew has left.
+    legacy: Option<Legacy>,
+    /// The last belief that nothing spoke against, and its time.
+    sound: Option<(Stamp, Belief)>,
+    watch: SensorWatch,
+    /// Of the next frame.
+    notes: Vec<Note>,
+    last_imu: Option<Stamp>,
+    last_frame: Option<Stamp>,
     waiting_reason: Option<String>,
     map_every: u64,
     health: Health,
@@ -65,6 +77,8 @@ pub struct OdometryStats {
     /// Frames without enough matched points for an update.
     pub frames_without_update: u64,
     pub imu_gaps: u64,
+    /// Frames and IMU samples left out since they were no later than the one before.
+    pub out_of_order: u64,
     /// How the run was initialised; `None` if it never was.
     pub initialization: Option<String>,
     /// Why it was not, when it was not.
@@ -87,12 +101,15 @@ struct Running {
     /// Frames so far, those in which vision was lost left out: by them the map ages, so that it is
     /// still there when vision comes back.
     seeing_frames: u64,
+    /// Frames in a row that showed enough but nothing of the map.
+    blind_frames: u64,
     /// Last sample of the IMU itself, not interpolated.
     last_sample: Option<Stamp>,
     /// The sample before the gap that was told of last.
     told_gap_after: Option<Stamp>,
     /// The start, until the vertical is known.
     vertical_sought_since: Option<Stamp>,
+    rest: RestDetector,
 }
 
 impl Odometry {
@@ -129,6 +146,12 @@ impl Odometry {
             frames_in: 0,
             now: None,
             running: None,
+            legacy: None,
+            sound: None,
+            watch: SensorWatch::new(&config.imu),
+            notes: Vec::new(),
+            last_imu: None,
+            last_frame: None,
             waiting_reason: None,
             map_every: 0,
             health: Health::new(&config.health),
@@ -146,7 +169,18 @@ impl Odometry {
             return;
         }
         self.advance(sample.stamp);
-        self.imu.push_back(sample);
+        if self.follows(self.last_imu, sample.stamp) {
+            self.last_imu = Some(sample.stamp);
+            self.notes.extend(self.watch.imu(&sample));
+            self.imu.push_back(sample);
+        }
+    }
+
+    /// Whether a stamp is later than the last one of its stream; counted if not.
+    fn follows(&mut self, last: Option<Stamp>, stamp: Stamp) -> bool {
+        let follows = last.is_none_or(|last| stamp > last);
+        self.stats.out_of_order += u64::from(!follows);
+        follows
     }
 
     pub fn push_truth(&mut self, pose: TruthPose) {
@@ -160,7 +194,10 @@ impl Odometry {
             return;
         }
         self.advance(frame.frame.stamp.offset_by(self.config.camera.time_offset));
-        self.frames.push_back((self.frames_in, frame));
+        if self.follows(self.last_frame, frame.frame.stamp) {
+            self.last_frame = Some(frame.frame.stamp);
+            self.frames.push_back((self.frames_in, frame));
+        }
         self.frames_in += 1;
     }
 
@@ -172,9 +209,15 @@ impl Odometry {
     pub fn stats(&self) -> OdometryStats {
         OdometryStats {
             waiting_reason: self.waiting_reason.clone(),
-            health: self.health.summary().clone(),
+            health: self.health_summary(),
             ..self.stats.clone()
         }
+    }
+
+    fn health_summary(&self) -> HealthSummary {
+        let rest = self.running.as_ref().map_or(0.0, |running| running.rest.seconds());
+        let summary = self.health.summary();
+        HealthSummary { seconds_at_rest: summary.seconds_at_rest + rest, ..summary.clone() }
     }
 
     pub fn truth(&self) -> &TruthTrack {
@@ -199,9 +242,9 @@ impl Odometry {
         if self.health.stops() {
             return None;
         }
-        let mut notes = Vec::new();
         while self.running.is_none() {
-            notes.extend(self.try_start()?);
+            let note = self.try_start()?;
+            self.notes.extend(note);
         }
         let (_, front) = self.frames.front()?;
         let stamp = self.frame_time(front);
@@ -211,7 +254,10 @@ impl Odometry {
             return None;
         }
         let (number, front) = self.frames.pop_front()?;
-        let report = self.process(number, &front, stamp, notes)?;
+        let report = self.process(number, &front, stamp)?;
+        if let Some(divergence) = self.health.restarts() {
+            self.leave_off(divergence, stamp);
+        }
         Some((report, front.frame))
     }
 
@@ -242,7 +288,11 @@ impl Odometry {
             now: self.now?,
             ended: self.ended,
         };
-        match self.initializer.attempt(&evidence) {
+        let attempt = match self.legacy {
+            Some(_) => self.initializer.anew().attempt(&evidence),
+            None => self.initializer.attempt(&evidence),
+        };
+        match attempt {
             Attempt::Wait => None,
             Attempt::NextFrame(reason) => {
                 // The first reason tells most: later ones may only say that the log has ended.
@@ -255,11 +305,21 @@ impl Odometry {
                 Some(None)
             }
             Attempt::Ready { belief, known, how } => {
-                let text = format!("initialised at {first_frame} s: {how}");
-                tracing::info!("{text}");
-                self.stats.initialization = Some(how);
                 self.waiting_reason = None;
-                self.start(*belief, known, first_frame);
+                let text = match self.legacy.take() {
+                    Some(legacy) => {
+                        let map = if legacy.map.is_some() { "kept" } else { "dropped" };
+                        let text = format!("re-initialised at {first_frame} s: {how}; map {map}");
+                        self.start_anew(*belief, legacy, first_frame);
+                        text
+                    }
+                    None => {
+                        let text = format!("initialised at {first_frame} s: {how}");
+                        self.stats.initialization = Some(how);
+                        self.start(*belief, known, first_frame);
+                        text
+                    }
+                };
                 Some(Some(Note { level: NoteLevel::Info, text }))
             }
         }
@@ -291,20 +351,45 @@ impl Odometry {
             time,
             expects_matches: false,
             seeing_frames: 0,
+            blind_frames: 0,
             last_sample: last_imu.map(|sample| sample.stamp),
             told_gap_after: None,
+            rest: RestDetector::new(&self.config.standstill, &self.config.imu),
         });
     }
 
-    fn process(
-        &mut self,
-        number: u64,
-        front: &FrontEndFrame,
-        stamp: Stamp,
-        mut notes: Vec<Note>,
-    ) -> Option<StepReport> {
+    /// Gives the estimate up; the next frame is the first one of another.
+    fn leave_off(&mut self, divergence: Divergence, stamp: Stamp) {
+        let Some(running) = self.running.take() else { return };
+        self.health.rested(running.rest.seconds());
+        let belief = *running.filter.belief();
+        self.legacy = Some(Legacy {
+            sound: self.sound.unwrap_or((stamp, belief)),
+            attitude: belief.state.world_from_body.rotation,
+            map: Legacy::keeps_map(divergence).then_some(running.map),
+            seeing_frames: running.seeing_frames,
+            last_sample: running.last_sample,
+        });
+    }
+
+    fn start_anew(&mut self, belief: Belief, legacy: Legacy, time: Stamp) {
+        let belief = legacy.place(belief, time, self.has_imu, &self.config.filter);
+        self.health.restarted(&belief);
+        self.start(belief, KnownAttitude::All, time);
+        if let Some(running) = &mut self.running {
+            running.last_sample = running.last_sample.or(legacy.last_sample);
+            if let Some(map) = legacy.map {
+                running.expects_matches = !map.is_empty();
+                running.seeing_frames = legacy.seeing_frames;
+                running.map = map;
+            }
+        }
+    }
+
+    fn process(&mut self, number: u64, front: &FrontEndFrame, stamp: Stamp) -> Option<StepReport> {
         let body_from_camera = self.body_from_camera();
         let running = self.running.as_mut()?;
+        let mut notes = std::mem::take(&mut self.notes);
         let view = View {
             config: &self.config,
             camera: &self.camera,
@@ -319,6 +404,7 @@ impl Odometry {
         times.propagation = clock.lap();
 
         let features = &front.features;
+        notes.extend(self.watch.frame(stamp, features, view.size));
         let (candidates, matches) = running.find_matches(features, &view);
         times.matching = clock.lap();
 
@@ -331,19 +417,44 @@ impl Odometry {
             self.stats.frames_without_update += 1;
         }
         notes.extend(running.tell_vertical(stamp));
-        let expected = std::mem::replace(&mut running.expects_matches, true);
-        notes.extend(self.health.see(stamp, updated.is_some(), expected));
+        let visible = features.iter().filter(|feature| feature.depth.is_some()).count();
+        let visible = visible >= view.config.search.min_matches;
+        let sight = Sight {
+            expected: std::mem::replace(&mut running.expects_matches, true),
+            visible,
+            features: features.len(),
+            matches: matches.len(),
+            inliers: inliers.len(),
+            updated: updated.is_some(),
+        };
+        notes.extend(self.health.see(stamp, sight));
+        notes.extend(running.judge_rest(stamp, &matches, &inliers, &view));
+        let belief = running.filter.belief();
+        let opened = updated.is_some_and(|outcome| outcome.screening.threshold.is_infinite());
+        let agreement = Agreement {
+            matches: matches.len(),
+            inliers: inliers.len(),
+            contradicted: opened && view.config.filter.has_gate(),
+        };
+        notes.extend(self.watch.agreement(stamp, agreement, &belief.state));
         let innovation = updated.map(|outcome| outcome.innovation);
-        notes.extend(self.health.judge(stamp, running.filter.belief(), innovation));
+        notes.extend(self.health.judge(stamp, belief, innovation));
+        if self.health.is_sound(innovation) {
+            self.sound = Some((stamp, *belief));
+        }
         times.update = clock.lap();
 
         if !self.health.is_lost() {
             running.seeing_frames += 1;
         }
+        if running.gives_up_map(visible, updated.is_some(), &view) {
+            notes.push(self.health.map_given_up(stamp));
+        }
+        let lost = self.health.is_lost();
         let estimate = running.filter.calibration().map(|estimate| estimate.body_from_camera);
         let body_from_camera = estimate.unwrap_or(body_from_camera);
         let view = View { body_from_camera: &body_from_camera, ..view };
-        let fates = running.grow_map(features, &matches, &inliers, treatment, &view);
+        let fates = running.grow_map(features, &matches, &inliers, treatment, lost, &view);
         times.map = clock.lap();
 
         self.stats.frames_processed += 1;
@@ -453,6 +564,7 @@ impl Running {
             }
             imu.pop_front();
             self.last_sample = Some(to.stamp);
+            self.rest.push_imu(to);
         }
         self.last_imu = Some(last);
         self.time = stamp;
@@ -604,30 +716,88 @@ impl Running {
             .filter_map(|&i| matches.get(i))
             .map(|m| (m.point, point_pair(&m.correspondence, view)))
             .collect();
+        let held =
+            |points: &dyn PointState| pairs.iter().any(|(id, _)| points.estimate(*id).is_some());
         let outcome = match self.filter.point_state() {
-            Some(points) => {
+            Some(points) if held(points) => {
                 let seen: Vec<_> = pairs.iter().map(|(id, pair)| seen_point(*id, pair)).collect();
                 points.measure(&seen)?
             }
+            Some(_) => return self.find_back(&pairs, view),
             None => {
                 let only_pairs: Vec<_> = pairs.iter().map(|(_, pair)| *pair).collect();
                 self.filter.update(&only_pairs)?
             }
         };
-        let turn = self.filter.take_world_turn();
-        if treatment != MapTreatment::Fixed && turn.is_none() {
-            // Points that were not offered, being none of the state, pass.
-            let passed = self.filter.passed().iter().chain(std::iter::repeat(&true));
+        if !self.follow_world() && treatment != MapTreatment::Fixed {
+            let passed = self.filter.passed().iter();
             for ((id, pair), _) in pairs.iter().zip(passed).filter(|(_, passed)| **passed) {
                 if let Some(refined) = self.filter.refine(pair) {
                     self.map.relocate(*id, refined.position, refined.covariance);
                 }
             }
         }
+        Some(outcome)
+    }
+
+    /// Leads a filter none of whose points is seen back to the map, by points that were there
+    /// before vision was lost: their errors are treated as independent of the belief's.
+    fn find_back(&mut self, pairs: &[(u64, PointPair)], view: &View) -> Option<UpdateOutcome> {
+        let old =
+            |id: u64| self.map.get(id).is_some_and(|point| point.first_seen < self.seeing_frames);
+        let known: Vec<_> =
+            pairs.iter().filter(|(id, _)| old(*id)).map(|(_, pair)| *pair).collect();
+        let enough = known.len() >= view.config.ransac.min_inliers;
+        let outcome = if enough { self.filter.update(&known)? } else { return None };
+        self.follow_world();
+        Some(outcome)
+    }
+
+    /// Turns the map if the filter has turned the world; true if so.
+    fn follow_world(&mut self) -> bool {
+        let turn = self.filter.take_world_turn();
         if let Some(turn) = turn {
             self.map.turn(&turn);
         }
-        Some(outcome)
+        turn.is_some()
+    }
+
+    /// Conditions the belief on rest if the body is at rest; a note where that begins or ends.
+    fn judge_rest(
+        &mut self,
+        stamp: Stamp,
+        matches: &[Association],
+        inliers: &[usize],
+        view: &View,
+    ) -> Option<Note> {
+        let seen = inliers
+            .iter()
+            .filter_map(|&i| matches.get(i))
+            .map(|m| (m.point, in_body(&m.correspondence.measurement, view).0))
+            .collect();
+        let (rest, note) = self.rest.judge(stamp, &self.filter.belief().state, seen);
+        if let Some(rest) = rest.filter(|_| view.config.standstill.update) {
+            self.filter.rest(&rest);
+            self.follow_world();
+        }
+        note
+    }
+
+    /// Empties the map and the state's part of it when nothing there has been found again for as
+    /// many frames as the configuration allows, though there was enough to see; true if so.
+    fn gives_up_map(&mut self, visible: bool, updated: bool, view: &View) -> bool {
+        self.blind_frames = if updated { 0 } else { self.blind_frames + u64::from(visible) };
+        let patience = view.config.filter.state_max_unseen_frames;
+        let Some(points) = self.filter.point_state().filter(|_| self.blind_frames > patience)
+        else {
+            return false;
+        };
+        for id in points.ids() {
+            points.release(id);
+        }
+        self.map = Map::new(&view.config.map);
+        self.blind_frames = 0;
+        true
     }
 
     /// Renews the points seen, inserts new ones, forgets old ones. What became of each feature
@@ -638,9 +808,12 @@ impl Running {
         matches: &[Association],
         inliers: &[usize],
         treatment: MapTreatment,
+        lost: bool,
         view: &View,
     ) -> Vec<Fate> {
         let number = self.seeing_frames;
+        // Points placed by a prediction that drifts would hide the map that is looked for.
+        let searching = lost && !self.map.is_empty() && self.filter.point_state().is_some();
         let world_from_camera = self.world_from_camera(view);
         let sighting = |feature: &Feature, reference| Sighting {
             frame: number,
@@ -669,7 +842,7 @@ impl Running {
             }
         }
         for (feature, fate) in features.iter().zip(&mut fates) {
-            if fate.role != KeypointRole::Unmatched {
+            if searching || fate.role != KeypointRole::Unmatched {
                 continue;
             }
             let Some(measurement) = feature.measurement(view.camera) else { continue };

@@ -89,6 +89,7 @@ impl StageTimes {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum NoteLevel {
     Info,
     Warning,

@@ -1,0 +1,339 @@
+//! What is wrong with the sensors, told from their data alone.
+
+use nalgebra::Vector3;
+
+use super::{Note, NoteLevel};
+use crate::inertial::{ImuConfig, ImuSample, NavState, Stamp};
+use crate::vision::Feature;
+
+/// An alarm is over when nothing has set it off for this long, s.
+const QUIET: f64 = 1.0;
+/// Intervals outside of these multiples of the usual one are irregular.
+const REGULAR: std::ops::Range<f64> = 0.5..1.7;
+/// The usual is learned from so many values before anything is held against it, and follows
+/// later ones at the inverse rate.
+const LEARNING: u32 = 20;
+/// Noise of the IMU this many times the usual one is a burst.
+const NOISE_BURST: f64 = 4.0;
+/// Samples over which noise is averaged.
+const NOISE_SAMPLES: usize = 12;
+/// Parts of the image, across and down, in which features are counted.
+const PARTS: (usize, usize) = (4, 3);
+/// With features in less than this share of the usual number of parts the view is obstructed.
+const OBSTRUCTED: f64 = 0.7;
+/// A bias beyond this many of its standard deviations at the start is no bias of this sensor.
+const UNUSUAL_BIAS: f64 = 5.0;
+/// What no hand and no vehicle does, rad/s and m/s^2: units are wrong, or the sensor is.
+const MAX_RATE: f64 = 20.0;
+const MAX_FORCE: f64 = 150.0;
+/// The mean specific force is compared with gravity over about this time, s, and within this factor.
+const FORCE_TIME: f64 = 0.3;
+const FORCE_FACTOR: f64 = 1.6;
+/// With less than this share of the matches agreeing, when there are this many, something moves.
+const AGREEING: f64 = 0.5;
+const MANY_MATCHES: usize = 30;
+
+/// Speaks once when a condition is first met, and again only after it was absent for a while.
+#[derive(Debug, Clone, Default)]
+struct Alarm {
+    last: Option<Stamp>,
+}
+
+impl Alarm {
+    fn tell(&mut self, stamp: Stamp, met: bool, text: impl FnOnce() -> String) -> Option<Note> {
+        if !met {
+            return None;
+        }
+        let new = self.last.is_none_or(|last| stamp.seconds_since(last) > QUIET);
+        self.last = Some(stamp);
+        new.then(|| Note { level: NoteLevel::Warning, text: text() })
+    }
+}
+
+/// A value's usual size.
+#[derive(Debug, Clone, Default)]
+struct Usual {
+    mean: f64,
+    count: u32,
+}
+
+impl Usual {
+    /// `None` while it is being learned.
+    fn value(&self) -> Option<f64> {
+        (self.count >= LEARNING).then_some(self.mean)
+    }
+
+    fn learn(&mut self, value: f64) {
+        self.count = (self.count + 1).min(LEARNING);
+        self.mean += (value - self.mean) / f64::from(self.count);
+    }
+}
+
+/// Whether the stamps of a stream follow each other as they usually do.
+#[derive(Debug, Clone, Default)]
+struct Regularity {
+    last: Option<Stamp>,
+    usual: Usual,
+    alarm: Alarm,
+}
+
+impl Regularity {
+    /// Takes note of a stamp; intervals longer than `longest` are told of elsewhere.
+    fn see(&mut self, stamp: Stamp, stream: &str, longest: f64) -> Option<Note> {
+        let interval = stamp.seconds_since(self.last.replace(stamp)?);
+        let usual = self.usual.value();
+        let irregular = usual.filter(|usual| !REGULAR.contains(&(interval / usual)));
+        let Some(usual) = irregular else {
+            self.usual.learn(interval);
+            return None;
+        };
+        self.alarm.tell(stamp, interval <= longest, || {
+            format!(
+                "irregular stamps of the {stream} at {stamp} s: an interval of {:.1} ms, usually \
+                 {:.1} ms",
+                1e3 * interval,
+                1e3 * usual
+            )
+        })
+    }
+}
+
+/// White noise of a stream of vectors, by second differences, in which motion all but cancels.
+#[derive(Debug, Clone, Default)]
+struct NoiseLevel {
+    last: [Vector3<f64>; 2],
+    seen: usize,
+    squares: Vec<f64>,
+    usual: Usual,
+    alarm: Alarm,
+}
+
+impl NoiseLevel {
+    fn see(&mut self, stamp: Stamp, value: Vector3<f64>, stream: &str) -> Option<Note> {
+        let [before, last] = self.last;
+        self.last = [last, value];
+        self.seen += 1;
+        if self.seen < 3 {
+            return None;
+        }
+        // The second difference of white noise has six times its variance.
+        self.squares.push((value - 2.0 * last + before).norm_squared() / 18.0);
+        if self.squares.len() < NOISE_SAMPLES {
+            return None;
+        }
+        let level = (self.squares.drain(..).sum::<f64>() / NOISE_SAMPLES as f64).sqrt();
+        let usual = self.usual.value();
+        let Some(usual) = usual.filter(|usual| level > NOISE_BURST * usual) else {
+            self.usual.learn(level);
+            return None;
+        };
+        self.alarm.tell(stamp, true, || {
+            format!("noise of the {stream} at {stamp} s is {:.0} times the usual", level / usual)
+        })
+    }
+}
+
+/// Watches the data of all sensors.
+#[derive(Debug, Clone)]
+pub(super) struct SensorWatch {
+    imu: ImuConfig,
+    imu_stamps: Regularity,
+    /// Magnitude of the specific force, averaged over [`FORCE_TIME`], and the time of it.
+    force: Option<(Stamp, f64)>,
+    units: Alarm,
+    gyroscope: NoiseLevel,
+    accelerometer: NoiseLevel,
+    frame_stamps: Regularity,
+    usual_parts: Usual,
+    obstruction: Alarm,
+    moving: Alarm,
+    contradiction: Alarm,
+    bias: Alarm,
+}
+
+/// What matching and conditioning made of a frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Agreement {
+    pub matches: usize,
+    pub inliers: usize,
+    /// Whether most inliers contradict the prediction.
+    pub contradicted: bool,
+}
+
+impl SensorWatch {
+    pub fn new(imu: &ImuConfig) -> Self {
+        Self {
+            imu: imu.clone(),
+            imu_stamps: Regularity::default(),
+            force: None,
+            units: Alarm::default(),
+            gyroscope: NoiseLevel::default(),
+            accelerometer: NoiseLevel::default(),
+            frame_stamps: Regularity::default(),
+            usual_parts: Usual::default(),
+            obstruction: Alarm::default(),
+            moving: Alarm::default(),
+            contradiction: Alarm::default(),
+            bias: Alarm::default(),
+        }
+    }
+
+    pub fn imu(&mut self, sample: &ImuSample) -> impl Iterator<Item = Note> {
+        let stamp = sample.stamp;
+        let stamps = self.imu_stamps.see(stamp, "IMU", self.imu.max_gap);
+        let gyroscope = self.gyroscope.see(stamp, sample.angular_velocity, "gyroscope");
+        let accelerometer = self.accelerometer.see(stamp, sample.specific_force, "accelerometer");
+        let implausible = self.implausible(sample);
+        stamps.into_iter().chain(gyroscope).chain(accelerometer).chain(implausible)
+    }
+
+    /// Tells of readings that are none of a body on earth.
+    fn implausible(&mut self, sample: &ImuSample) -> Option<Note> {
+        let (stamp, gravity) = (sample.stamp, self.imu.gravity);
+        let (rate, now) = (sample.angular_velocity.norm(), sample.specific_force.norm());
+        let mean = self.force.map_or(now, |(last, mean)| {
+            let share = (stamp.seconds_since(last) / FORCE_TIME).clamp(0.0, 1.0);
+            mean + (now - mean) * share
+        });
+        self.force = Some((stamp, mean));
+        let weight =
+            gravity > 0.0 && !(gravity / FORCE_FACTOR..gravity * FORCE_FACTOR).contains(&mean);
+        let implausible = weight || rate > MAX_RATE || now > MAX_FORCE;
+        self.units.tell(stamp, implausible, || {
+            format!(
+                "implausible IMU readings at {stamp} s: {rate:.2} rad/s, specific force {mean:.2} \
+                 m/s^2 on average (gravity is {gravity:.2}): check imu.gyroscope_scale and \
+                 imu.accelerometer_scale"
+            )
+        })
+    }
+
+    /// Of an image of this size, width and height in pixels.
+    pub fn frame(
+        &mut self,
+        stamp: Stamp,
+        features: &[Feature],
+        size: (usize, usize),
+    ) -> impl Iterator<Item = Note> {
+        let stamps = self.frame_stamps.see(stamp, "frames", f64::INFINITY);
+        let parts = occupied_parts(features, size);
+        let usual = self.usual_parts.value().filter(|u| (parts as f64) < OBSTRUCTED * u);
+        let obstructed = match usual {
+            Some(usual) => self.obstruction.tell(stamp, true, || {
+                let all = PARTS.0 * PARTS.1;
+                format!(
+                    "view obstructed at {stamp} s: features in {parts} of {all} parts of the \
+                     image, usually in {usual:.0}"
+                )
+            }),
+            None => {
+                self.usual_parts.learn(parts as f64);
+                None
+            }
+        };
+        stamps.into_iter().chain(obstructed)
+    }
+
+    pub fn agreement(
+        &mut self,
+        stamp: Stamp,
+        seen: Agreement,
+        state: &NavState,
+    ) -> impl Iterator<Item = Note> {
+        let Agreement { matches, inliers, contradicted } = seen;
+        let few = matches >= MANY_MATCHES && (inliers as f64) < AGREEING * matches as f64;
+        let moving = self.moving.tell(stamp, few, || {
+            format!(
+                "matches disagree at {stamp} s: {inliers} of {matches} agree on one pose; something \
+                 moves, or the image is blurred"
+            )
+        });
+        let contradiction = self.contradiction.tell(stamp, contradicted, || {
+            format!("most points contradict the prediction at {stamp} s: the gate is opened")
+        });
+        let beyond = |bias: f64, sd: f64| sd > 0.0 && bias > UNUSUAL_BIAS * sd;
+        let (gyro, accel) = (state.gyro_bias.amax(), state.accel_bias.amax());
+        let unusual = beyond(gyro, self.imu.gyro_bias_sd) || beyond(accel, self.imu.accel_bias_sd);
+        let bias = self.bias.tell(stamp, unusual, || {
+            format!(
+                "unusual bias at {stamp} s: gyroscope {gyro:.3} rad/s, accelerometer {accel:.2} \
+                 m/s^2, beyond {UNUSUAL_BIAS} times the configured standard deviations"
+            )
+        });
+        moving.into_iter().chain(contradiction).chain(bias)
+    }
+}
+
+/// Parts of the image in which there are features.
+fn occupied_parts(features: &[Feature], size: (usize, usize)) -> usize {
+    let mut occupied = [false; PARTS.0 * PARTS.1];
+    let part = |at: f64, length: usize, parts: usize| {
+        let part = (at / length as f64 * parts as f64).max(0.0) as usize;
+        part.min(parts - 1)
+    };
+    for feature in features {
+        let column = part(feature.pixel.x, size.0, PARTS.0);
+        let row = part(feature.pixel.y, size.1, PARTS.1);
+        occupied[row * PARTS.0 + column] = true;
+    }
+    occupied.into_iter().filter(|occupied| *occupied).count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(seconds: f64) -> Stamp {
+        Stamp::default().offset_by(seconds)
+    }
+
+    #[test]
+    fn irregular_stamps_are_told_once_an_episode() {
+        let mut stamps = Regularity::default();
+        let mut told = Vec::new();
+        let mut time = 0.0;
+        for k in 0..400 {
+            // A sample is missing at 100, then every second one until 120, then one at 350.
+            time += if k == 350 || (100..120).contains(&k) { 0.02 } else { 0.01 };
+            told.extend(stamps.see(at(time), "IMU", 0.1).map(|_| k));
+        }
+        assert_eq!(told, [100, 350]);
+        // A gap is not told here.
+        assert_eq!(stamps.see(at(time + 3.0), "IMU", 0.1), None);
+    }
+
+    #[test]
+    fn a_burst_of_noise_is_told_and_motion_is_not() {
+        let mut level = NoiseLevel::default();
+        let mut told = Vec::new();
+        for k in 0..2000 {
+            let t = k as f64 * 0.005;
+            let noise = if (1000..1100).contains(&k) { 0.2 } else { 0.02 };
+            let motion = if k > 500 { 3.0 * (6.0 * t).sin() } else { 0.0 };
+            let alternating = if k % 2 == 0 { noise } else { -noise };
+            let value = Vector3::new(motion + alternating, 0.0, 9.8);
+            told.extend(level.see(at(t), value, "accelerometer").map(|_| k));
+        }
+        assert!(told.len() == 1 && (1000..1030).contains(&told[0]), "{told:?}");
+    }
+
+    #[test]
+    fn disagreement_contradiction_and_biases_are_named() {
+        let mut watch = SensorWatch::new(&ImuConfig::default());
+        let mut state = NavState {
+            world_from_body: nalgebra::Isometry3::identity(),
+            velocity: Vector3::zeros(),
+            gyro_bias: Vector3::zeros(),
+            accel_bias: Vector3::zeros(),
+        };
+        let mut told = |inliers, contradicted, state: &NavState| -> Vec<String> {
+            let seen = Agreement { matches: 100, inliers, contradicted };
+            watch.agreement(at(0.0), seen, state).map(|note| note.text).collect()
+        };
+        assert!(told(90, false, &state).is_empty());
+        assert!(told(40, false, &state)[0].contains("40 of 100 matches"));
+        assert!(told(40, true, &state)[0].contains("contradict"));
+        state.gyro_bias.z = -6.0 * ImuConfig::default().gyro_bias_sd;
+        assert!(told(90, false, &state)[0].contains("unusual bias"));
+    }
+}
