@@ -227,3 +227,57 @@ fn the_quirks_of_vcu_rvi_are_configuration() {
     let guessed = json(&["replay", text(&log), "--json"]);
     assert_eq!(guessed["config"], "vcu_rvi");
 }
+
+/// In the middle of a log, each by itself: it is named at once, and all that is written is valid.
+#[test]
+fn faults_are_named_and_survived() {
+    let log = text(simulated_log());
+    let mut arguments = vec!["faults", log, "--json"];
+    let faults = ["black:1.8:0.3", "imu-gap:1.8:0.3", "covered:1.8:0.5", "imu-noise:1.8:0.3"];
+    faults.iter().for_each(|fault| arguments.extend(["--fault", fault]));
+    let report = json(&arguments);
+    let outcomes = report["outcomes"].as_array().unwrap();
+    assert_eq!(outcomes.len(), 1 + faults.len());
+    for (outcome, fault) in outcomes.iter().skip(1).zip(faults) {
+        assert_eq!(outcome["fault"], fault);
+        assert_eq!((&outcome["valid"], &outcome["frames"]), (&true.into(), &91.into()), "{fault}");
+        let delay = outcome["named"]["delay"].as_f64().unwrap_or_else(|| panic!("{fault}"));
+        assert!((-0.05..0.5).contains(&delay), "{fault}: {delay}");
+    }
+    assert_eq!(outcomes[0]["named"], serde_json::Value::Null);
+    let wrong = mfg_vio(&["replay", log, "--fault", "blak:1:1"]);
+    assert_eq!(wrong.status.code(), Some(2));
+}
+
+/// The log begins with a second and a half of rest.
+#[test]
+fn rest_is_found_and_told() {
+    let metrics = json(&["replay", text(simulated_log()), "--json"]);
+    let rest = metrics["health"]["seconds_at_rest"].as_f64().unwrap();
+    assert!((0.5..2.0).contains(&rest), "{rest}");
+    let notes: Vec<_> = metrics["notes"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|note| note["text"].as_str().unwrap())
+        .collect();
+    assert!(notes.iter().any(|text| text.starts_with("at rest")), "{notes:?}");
+    assert!(notes.iter().any(|text| text.starts_with("moving again")), "{notes:?}");
+}
+
+/// A divergence that never was, by an absurd limit: the estimate starts anew again and again, its
+/// outputs stay in order, and it is told.
+#[test]
+fn a_new_start_keeps_the_outputs_valid() {
+    let run = |policy: &str| {
+        let policy = format!("health.on_divergence={policy}");
+        let limit = "health.max_speed=0.15";
+        json(&["replay", text(simulated_log()), "--set", &policy, "--set", limit, "--json"])
+    };
+    let metrics = run("reinitialize");
+    assert!(metrics["health"]["reinitializations"].as_u64().unwrap() > 0);
+    assert_eq!(metrics["frames_processed"], metrics["read"]["frames"]);
+    assert!(rmse(&metrics) < 0.1, "{}", rmse(&metrics));
+    let stopped = run("stop");
+    assert!(stopped["frames_processed"].as_u64() < metrics["frames_processed"].as_u64());
+}

@@ -43,6 +43,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         duration: f64::INFINITY,
         summary: dataset::detect(&log)?,
         recording: Target::files(&args.out),
+        faults: vec![],
     };
     let replayed = plan.execute()?;
     write_html(&args.out.join("report.html"), &report(&replayed))?;

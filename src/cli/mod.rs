@@ -6,6 +6,8 @@ mod convert;
 mod demo;
 mod evaluate;
 mod experiment;
+#[cfg(feature = "vision")]
+mod faults;
 mod fisher;
 mod gnss;
 mod info;
@@ -36,6 +38,8 @@ enum Command {
     Demo(demo::Args),
     #[cfg(feature = "vision")]
     Replay(replay::Args),
+    #[cfg(feature = "vision")]
+    Faults(faults::FaultsArgs),
     Simulate(simulate::SimulateArgs),
     Attitude(attitude::AttitudeArgs),
     Convert(convert::Args),
@@ -55,6 +59,8 @@ pub fn main() -> ExitCode {
         Command::Demo(args) => demo::run(&args),
         #[cfg(feature = "vision")]
         Command::Replay(args) => replay::run(&args),
+        #[cfg(feature = "vision")]
+        Command::Faults(args) => faults::run(&args),
         Command::Simulate(args) => simulate::run(args),
         Command::Attitude(args) => attitude::run(&args),
         Command::Convert(args) => convert::run(&args),

@@ -6,7 +6,7 @@ use nalgebra::Isometry3;
 
 use super::terminal::{INTERRUPTED, catch_interrupts, progress};
 use mfg_vio::config::Config;
-use mfg_vio::dataset::{self, LogSummary};
+use mfg_vio::dataset::{self, Fault, LogSummary};
 use mfg_vio::filter::FilterKind;
 #[cfg(feature = "viewer")]
 use mfg_vio::inertial::ImuSample;
@@ -59,6 +59,11 @@ pub struct Args {
     /// Reference trajectory (TUM, EuRoC, KITTI or VCU-RVI format) instead of the log's.
     #[arg(long, value_name = "TRAJ")]
     truth: Option<PathBuf>,
+    /// Inject a fault, KIND:START:LENGTH[:AMOUNT] with times in s after the log's first message,
+    /// e.g. black:5:1 (repeatable). Kinds: black, covered, object, imu-gap, imu-noise, bias,
+    /// accel-unit, gyro-unit, imu-stamps, frame-stamps, jitter, dropped, repeated, kidnapped.
+    #[arg(long = "fault", value_name = "SPEC")]
+    faults: Vec<Fault>,
     /// Print the metrics as one JSON object.
     #[arg(long)]
     json: bool,
@@ -117,6 +122,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         duration: args.duration,
         summary,
         recording: recording_targets(args),
+        faults: args.faults.clone(),
     };
     let replayed = plan.execute()?;
     if args.json {
@@ -180,6 +186,7 @@ pub struct Plan<'a> {
     pub duration: f64,
     pub summary: LogSummary,
     pub recording: Vec<Target>,
+    pub faults: Vec<Fault>,
 }
 
 impl Plan<'_> {
@@ -214,6 +221,7 @@ impl Plan<'_> {
             duration: self.duration,
             out: self.out,
             truth: self.truth,
+            faults: self.faults,
             stop: &INTERRUPTED,
         };
         let replayed = replay(&request, &mut front_end, &mut [&mut bar, &mut recording]);

@@ -3,6 +3,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::inertial::Stamp;
 use crate::odometry::Event;
 use crate::vision::CameraConfig;
 
@@ -14,9 +15,18 @@ pub struct ReadReport {
     pub truth_poses: u64,
     /// Messages left out, by reason (`"color image: buffer too short"`).
     pub skipped: BTreeMap<String, u64>,
+    /// When the first one was left out, where its stamp is known.
+    #[serde(skip)]
+    pub first_skipped: BTreeMap<String, Stamp>,
 }
 
 impl ReadReport {
+    /// Counts a message left out that has a stamp.
+    pub fn skip_at(&mut self, reason: &str, stamp: Stamp) {
+        self.first_skipped.entry(reason.to_owned()).or_insert(stamp);
+        self.skip(reason, format_args!("at {stamp} s"));
+    }
+
     /// Counts a message left out; warns with `detail` the first time for each reason.
     pub fn skip(&mut self, reason: &str, detail: impl std::fmt::Display) {
         let count = self.skipped.entry(reason.to_owned()).or_default();

@@ -199,7 +199,7 @@ impl StampGate {
     fn discard(&mut self, report: &mut ReadReport) {
         if let Some(held) = self.held.take() {
             let reason = format!("{}: stamp far from its neighbours", STREAMS[held.stream()]);
-            report.skip(&reason, format_args!("at {} s", held.stamp()));
+            report.skip_at(&reason, held.stamp());
         }
     }
 }
@@ -236,7 +236,7 @@ impl ReorderBuffer {
         let (stamp, size, stream) = (reading.stamp(), reading.size(), STREAMS[reading.stream()]);
         if self.released.is_some_and(|released| stamp <= released) {
             let reason = format!("{stream}: out of order beyond the reorder window, or repeated");
-            report.skip(&reason, format_args!("at {stamp} s"));
+            report.skip_at(&reason, stamp);
             return;
         }
         let new = match reading {
@@ -245,13 +245,13 @@ impl ReorderBuffer {
             Reading::Imu(sample) => self.add_event(0, Event::Imu(sample)),
             Reading::Truth(pose) => self.add_event(1, Event::Truth(pose)),
             Reading::Right(..) => {
-                report.skip("right image: no calibration", format_args!("at {stamp} s"));
+                report.skip_at("right image: no calibration", stamp);
                 return;
             }
         };
         if !new {
             let reason = format!("{stream}: repeated stamp");
-            report.skip(&reason, format_args!("at {stamp} s"));
+            report.skip_at(&reason, stamp);
             return;
         }
         self.size += size;
@@ -299,12 +299,12 @@ impl ReorderBuffer {
             Paired::LoneColor(stamp, color) => {
                 *size = size.saturating_sub(color_size(&color));
                 let reason = "color image: no depth image near enough in time";
-                report.skip(reason, format_args!("at {stamp} s"));
+                report.skip_at(reason, stamp);
             }
             Paired::LoneDepth(stamp, depth) => {
                 *size = size.saturating_sub(depth_size(&depth));
                 let reason = "depth image: no color image near enough in time";
-                report.skip(reason, format_args!("at {stamp} s"));
+                report.skip_at(reason, stamp);
             }
         });
         while let Some(entry) = events.first_entry() {

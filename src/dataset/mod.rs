@@ -9,6 +9,7 @@ mod convert;
 mod definition;
 mod euroc;
 mod event;
+mod fault;
 mod folder;
 mod imu_csv;
 mod inspect;
@@ -36,6 +37,7 @@ use crate::vision::RgbdFrame;
 
 pub use convert::{ConvertError, ConvertSummary, convert};
 pub use event::{Log, LogConfig, LogError, LogSummary, ReadReport};
+pub use fault::{Fault, FaultKind};
 pub use imu_csv::{ImuCsv, ImuRow};
 pub use inspect::{
     AccelerometerUnit, Assumed, ColorInspection, DepthInspection, Evidence, Finding, Gap,
@@ -43,5 +45,5 @@ pub use inspect::{
     TopicInspection, Verdict, inspect,
 };
 pub use navigation_csv::{TableError, read_imu_table, read_position_table};
-pub use open::{detect, open};
+pub use open::{detect, open, open_with_faults};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

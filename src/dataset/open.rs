@@ -4,6 +4,7 @@ use std::io::Read;
 use std::path::Path;
 
 use super::bag::{Bag, BagFormat};
+use super::fault::FaultySource;
 use super::folder::{FolderSource, Listing};
 use super::mcap_file::{McapFile, McapFormat};
 use super::merge::{MergedLog, ReadingSource};
@@ -11,7 +12,7 @@ use super::records::Format as _;
 use super::ros::{MessageSource, RosSource, Survey};
 use super::section::LogFile;
 use super::stereo::StereoSource;
-use super::{Log, LogConfig, LogError, LogSummary, euroc, seven_scenes, tum};
+use super::{Fault, Log, LogConfig, LogError, LogSummary, euroc, seven_scenes, tum};
 use crate::inertial::ImuConfig;
 use crate::vision::StereoRig;
 
@@ -65,18 +66,32 @@ impl MessageLog {
 /// give no depth, [`LogError::Config`] if a key of `log` has no meaning, [`LogError::Io`] if it
 /// cannot be read.
 pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log>, LogError> {
+    open_with_faults(path, log, imu, &[])
+}
+
+/// As [`open`], with faults injected into the messages before they are ordered and paired.
+///
+/// # Errors
+/// Those of [`open`].
+pub fn open_with_faults(
+    path: &Path,
+    log: &LogConfig,
+    imu: &ImuConfig,
+    faults: &[Fault],
+) -> Result<Box<dyn Log>, LogError> {
     log.validate()?;
     Ok(match Contents::of(path, log)? {
         Contents::Folder(folder) => {
             let (summary, listing) = *folder;
             let stereo = listing.stereo.clone();
-            let source = FolderSource::new(listing, log, imu);
+            let source = FaultySource::new(FolderSource::new(listing, log, imu), faults, imu);
             match stereo {
                 Some(rig) => stereo_log(source, summary, rig, log),
                 None => {
-                    // The entries are sorted already.
+                    // The entries are sorted already, unless their stamps were spoilt.
                     let sorted = LogConfig { reorder_window: 0.0, ..log.clone() };
-                    Box::new(MergedLog::new(source, summary, &sorted))
+                    let order = if faults.is_empty() { &sorted } else { log };
+                    Box::new(MergedLog::new(source, summary, order))
                 }
             }
         }
@@ -85,6 +100,7 @@ pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log
             let place = (path, messages.kind());
             let (source, summary, rig) =
                 RosSource::new(messages.messages(), &survey, place, log, imu)?;
+            let source = FaultySource::new(source, faults, imu);
             match rig {
                 Some(rig) => stereo_log(source, summary, rig, log),
                 None => Box::new(MergedLog::new(source, summary, log)),

@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::Evaluation;
 use crate::dataset::ReadReport;
 use crate::filter::Calibration;
-use crate::odometry::{OdometryStats, StageTimes};
+use crate::odometry::{HealthSummary, NoteLevel, OdometryStats, StageTimes};
 
 #[derive(Debug, Clone, Serialize)]
 pub struct Metrics {
@@ -42,6 +42,17 @@ pub struct Metrics {
     pub evaluation: Option<Evaluation>,
     /// Why there is a reference but no evaluation.
     pub evaluation_failure: Option<String>,
+    /// What happened, in order of time.
+    pub notes: Vec<LogEntry>,
+}
+
+/// Something that happened.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LogEntry {
+    /// Stamp of the frame, or of the message that was left out, s.
+    pub seconds: f64,
+    pub level: NoteLevel,
+    pub text: String,
 }
 
 /// Calibration between camera and IMU with standard deviations.
@@ -90,6 +101,7 @@ impl Metrics {
             ),
             ("IMU samples, gaps", format!("{}, {}", self.read.imu_samples, self.odometry.imu_gaps)),
             ("messages skipped", format!("{}", self.read.skipped.values().sum::<u64>())),
+            ("health", self.health()),
             (
                 "time",
                 format!(
@@ -133,6 +145,30 @@ impl Metrics {
             rows.push(("no evaluation", reason.clone()));
         }
         rows
+    }
+}
+
+impl Metrics {
+    fn health(&self) -> String {
+        let HealthSummary {
+            seconds_without_vision,
+            longest_without_vision,
+            seconds_at_rest,
+            divergences,
+            reinitializations,
+        } = &self.odometry.health;
+        let warnings = self.notes.iter().filter(|note| note.level == NoteLevel::Warning).count();
+        let mut text = format!(
+            "{seconds_without_vision:.2} s without vision (longest {longest_without_vision:.2} s), \
+             {seconds_at_rest:.2} s at rest, {warnings} warnings"
+        );
+        if !divergences.is_empty() {
+            let (last, count) = (divergences.last().map_or("", String::as_str), divergences.len());
+            text += &format!(
+                ", diverged {count} times, re-initialised {reinitializations} times; last: {last}"
+            );
+        }
+        text
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod attitude;
 mod evaluation;
+mod faults;
 mod metrics;
 mod navigation;
 mod outputs;
@@ -16,18 +17,19 @@ use nalgebra::{Isometry3, Matrix6};
 
 pub use attitude::{AttitudeMetrics, AttitudeRequest, Reached, replay_attitude};
 pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors};
-pub use metrics::{Metrics, StageSummary};
+pub use faults::{FaultOutcome, Naming, Recovered, fault_grid};
+pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
 pub use outputs::state_columns;
 pub use report::{Series, figures, report};
 
 use crate::config::Config;
-use crate::dataset::{self, Log, LogError};
+use crate::dataset::{self, Fault, Log, LogError, ReadReport};
 use crate::evaluation::{EvaluationError, Trajectory, read_trajectory};
 use crate::filter::{FilterKind, pose_covariance};
 use crate::inertial::{ImuSample, Stamp};
 use crate::odometry::{
-    Event, FrontEnd, Observation, Odometry, RunOptions, StepReport, TruthPose, run,
+    Event, FrontEnd, NoteLevel, Observation, Odometry, RunOptions, StepReport, TruthPose, run,
 };
 use crate::vision::RgbdFrame;
 use evaluation::evaluate;
@@ -72,6 +74,8 @@ pub struct Request<'a> {
     pub out: Option<PathBuf>,
     /// Reference trajectory that replaces the log's.
     pub truth: Option<PathBuf>,
+    /// Injected into the log, and into the reference poses in it.
+    pub faults: Vec<Fault>,
     pub stop: &'a AtomicBool,
 }
 
@@ -96,6 +100,23 @@ pub struct Replayed {
     pub series: Series,
     /// With a reference.
     pub evaluated: Option<Evaluated>,
+    /// Stamp of the log's first event, s.
+    pub first_seconds: f64,
+    estimate: Vec<TruthPose>,
+    covariances: Vec<Matrix6<f64>>,
+}
+
+impl Replayed {
+    /// Whether stamps increase, poses are finite and covariances positive definite.
+    pub fn is_valid(&self) -> bool {
+        let pose = |pose: &TruthPose| {
+            let Isometry3 { translation, rotation } = pose.world_from_body;
+            translation.vector.iter().chain(rotation.coords.iter()).all(|x| x.is_finite())
+        };
+        self.estimate.windows(2).all(|pair| pair[0].stamp < pair[1].stamp)
+            && self.estimate.iter().all(pose)
+            && self.covariances.iter().all(|covariance| covariance.cholesky().is_some())
+    }
 }
 
 /// Replays a log. Files in `request.out` are valid whenever it returns, also when it was stopped.
@@ -105,7 +126,8 @@ pub fn replay(
     observers: &mut [&mut dyn Observer],
 ) -> Result<Replayed, ReplayError> {
     let config = &request.config;
-    let mut log = dataset::open(&request.log, &config.log, &config.imu)?;
+    let faults = &request.faults;
+    let mut log = dataset::open_with_faults(&request.log, &config.log, &config.imu, faults)?;
     let summary = log.summary().clone();
     for (role, source) in &summary.sources {
         tracing::info!("{role}: {source}");
@@ -119,6 +141,7 @@ pub fn replay(
         outputs: request.out.as_deref().map(Outputs::create).transpose()?,
         failure: None,
         series: Series::default(),
+        notes: Vec::new(),
         estimate: Vec::new(),
         covariances: Vec::new(),
         estimate_from_reference: None,
@@ -135,7 +158,15 @@ pub fn replay(
 
     let (clock, cpu_clock) = (Instant::now(), cpu_time::ProcessTime::now());
     let given = given.map(Iterator::peekable);
-    let events = EventSource { log: log.as_mut(), given, pending: None, truth: &mut truth };
+    let mut first = None;
+    let events = EventSource {
+        log: log.as_mut(),
+        given,
+        pending: None,
+        truth: &mut truth,
+        faults,
+        first: &mut first,
+    };
     let mut span = Span::default();
     run(events, front_end, &mut odometry, options, |observation| match observation {
         Observation::Imu(sample) => observers.iter_mut().for_each(|o| o.imu(sample)),
@@ -184,11 +215,33 @@ pub fn replay(
         calibration: odometry.calibration().map(Into::into),
         evaluation: evaluated.as_ref().map(|evaluated| evaluated.summary.clone()),
         evaluation_failure,
+        notes: with_skipped(session.notes, log.report()),
     };
     if let Some(directory) = &request.out {
         write_metrics(directory, &metrics)?;
     }
-    Ok(Replayed { metrics, series: session.series, evaluated })
+    Ok(Replayed {
+        metrics,
+        series: session.series,
+        evaluated,
+        first_seconds: first.unwrap_or_default().seconds(),
+        estimate: session.estimate,
+        covariances: session.covariances,
+    })
+}
+
+/// The notes and, in order of time, what the reader left out.
+fn with_skipped(mut notes: Vec<LogEntry>, read: &ReadReport) -> Vec<LogEntry> {
+    notes.extend(read.first_skipped.iter().map(|(reason, stamp)| LogEntry {
+        seconds: stamp.seconds(),
+        level: NoteLevel::Warning,
+        text: format!(
+            "skipped from {stamp} s on: {reason} ({} in all)",
+            read.skipped.get(reason).copied().unwrap_or_default()
+        ),
+    }));
+    notes.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
+    notes
 }
 
 fn given_truth(path: &Path) -> Result<std::vec::IntoIter<TruthPose>, ReplayError> {
@@ -247,6 +300,9 @@ struct EventSource<'a> {
     /// The log's next event, while given poses go before it.
     pending: Option<Event>,
     truth: &'a mut Vec<TruthPose>,
+    faults: &'a [Fault],
+    /// Stamp of the first event.
+    first: &'a mut Option<Stamp>,
 }
 
 impl EventSource<'_> {
@@ -265,6 +321,11 @@ impl Iterator for EventSource<'_> {
             Some(event) => event,
             None => self.next_of_log()?,
         };
+        if self.first.is_none() {
+            *self.first = Some(event.stamp());
+            let given = self.given.take();
+            self.given = given.map(|poses| faulty(poses, self.faults, event.stamp()).peekable());
+        }
         let due = |pose: &TruthPose| pose.stamp <= event.stamp();
         let given = self.given.as_mut().and_then(|poses| poses.next_if(due));
         let event = match given {
@@ -281,11 +342,28 @@ impl Iterator for EventSource<'_> {
     }
 }
 
+/// Given poses by the clocks of a log with faults, the first event of which is at `first`.
+fn faulty(
+    poses: impl Iterator<Item = TruthPose>,
+    faults: &[Fault],
+    first: Stamp,
+) -> std::vec::IntoIter<TruthPose> {
+    let by_clock = |pose: TruthPose| {
+        let stamp = faults.iter().try_fold(pose.stamp, |stamp, fault| {
+            let seconds = stamp.seconds_since(first);
+            Some(stamp.offset_by(fault.clock(seconds)? - seconds))
+        });
+        Some(TruthPose { stamp: stamp?, ..pose })
+    };
+    poses.filter_map(by_clock).collect::<Vec<_>>().into_iter()
+}
+
 /// What is gathered while the frames go by.
 struct Session {
     outputs: Option<Outputs>,
     failure: Option<ReplayError>,
     series: Series,
+    notes: Vec<LogEntry>,
     estimate: Vec<TruthPose>,
     /// Of (rotation, position), one a pose of `estimate`.
     covariances: Vec<Matrix6<f64>>,
@@ -303,6 +381,14 @@ impl Session {
         observers: &mut [&mut dyn Observer],
     ) {
         self.series.push(report);
+        for note in &report.notes {
+            match note.level {
+                NoteLevel::Info => tracing::info!("{}", note.text),
+                NoteLevel::Warning => tracing::warn!("{}", note.text),
+            }
+            let (seconds, text) = (report.stamp.seconds(), note.text.clone());
+            self.notes.push(LogEntry { seconds, level: note.level, text });
+        }
         let estimate = report.state.world_from_body;
         self.estimate.push(TruthPose { stamp: report.stamp, world_from_body: estimate });
         self.covariances.push(pose_covariance(&report.covariance));
