@@ -400,7 +400,13 @@ impl Odometry {
         };
         let mut times = StageTimes { features: front.seconds, ..StageTimes::default() };
         let mut clock = StageClock::start();
-        self.stats.imu_gaps += running.propagate_to(stamp, &mut self.imu, view.config, &mut notes);
+        self.stats.imu_gaps += running.propagate_to(
+            stamp,
+            &mut self.imu,
+            self.watch.is_noisy(stamp),
+            view.config,
+            &mut notes,
+        );
         times.propagation = clock.lap();
 
         let features = &front.features;
@@ -527,11 +533,13 @@ impl Fate {
 }
 
 impl Running {
-    /// Carries the belief to `stamp`; gives the number of gaps in the IMU data on the way.
+    /// Carries the belief to `stamp`, trusting `noisy` samples no more than those that stand in for
+    /// a gap; gives the number of gaps in the IMU data on the way.
     fn propagate_to(
         &mut self,
         stamp: Stamp,
         imu: &mut VecDeque<ImuSample>,
+        noisy: bool,
         config: &OdometryConfig,
         notes: &mut Vec<Note>,
     ) -> u64 {
@@ -547,7 +555,7 @@ impl Running {
             let until = next.map_or(stamp, |sample| sample.stamp);
             let gap = self.gap_before(until, config.imu.max_gap);
             gaps += u64::from(self.tell_gap(gap, notes));
-            self.filter.set_imu_gap(gap.is_some());
+            self.filter.set_imu_gap(gap.is_some() || noisy);
             let reached = next.filter(|sample| sample.stamp <= stamp);
             let to = match (reached, next) {
                 (Some(sample), _) => sample,

@@ -28,8 +28,8 @@ impl Legacy {
     }
 
     /// The first belief of the new start, moved to where the old one was last sound and turned to
-    /// its heading. Since then the body has moved at about `moving_velocity_sd`. Without an IMU
-    /// (`levelled` false) the whole attitude is the old one.
+    /// its heading. Since then the body has moved at about `moving_velocity_sd`; the biases may be
+    /// what went wrong. Without an IMU (`levelled` false) the whole attitude is the old one.
     pub fn place(
         &self,
         mut start: Belief,
@@ -54,9 +54,17 @@ impl Legacy {
         add(block::ROTATION, up * up.transpose() * heading_variance);
         let sound_position = sound.covariance.fixed_view::<3, 3>(block::POSITION, block::POSITION);
         add(block::POSITION, sound_position + Matrix3::identity() * moved.powi(2));
+        if levelled {
+            let first = block::GYRO_BIAS;
+            let mut biases = start.covariance.fixed_view_mut::<6, 6>(first, first);
+            biases *= BIAS_FACTOR.powi(2);
+        }
         start
     }
 }
+
+/// On the standard deviation of the biases of a start.
+const BIAS_FACTOR: f64 = 10.0;
 
 /// The turn about the vertical that brings `from` closest to `to`.
 fn heading_between(to: &UnitQuaternion<f64>, from: &UnitQuaternion<f64>) -> UnitQuaternion<f64> {

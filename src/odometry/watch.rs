@@ -15,6 +15,8 @@ const REGULAR: std::ops::Range<f64> = 0.5..1.7;
 const LEARNING: u32 = 20;
 /// Noise of the IMU this many times the usual one is a burst.
 const NOISE_BURST: f64 = 4.0;
+/// For so long after a burst was noticed samples count as noisy, s.
+const NOISE_MEMORY: f64 = 0.15;
 /// Samples over which noise is averaged.
 const NOISE_SAMPLES: usize = 12;
 /// Parts of the image, across and down, in which features are counted.
@@ -78,6 +80,11 @@ struct Regularity {
 }
 
 impl Regularity {
+    /// Whether more than `longest` seconds have passed since the last stamp.
+    fn pauses(&self, stamp: Stamp, longest: f64) -> bool {
+        self.last.is_some_and(|last| stamp.seconds_since(last) > longest)
+    }
+
     /// Takes note of a stamp; intervals longer than `longest` are told of elsewhere.
     fn see(&mut self, stamp: Stamp, stream: &str, longest: f64) -> Option<Note> {
         let interval = stamp.seconds_since(self.last.replace(stamp)?);
@@ -180,11 +187,22 @@ impl SensorWatch {
 
     pub fn imu(&mut self, sample: &ImuSample) -> impl Iterator<Item = Note> {
         let stamp = sample.stamp;
+        if self.imu_stamps.pauses(stamp, self.imu.max_gap) {
+            self.gyroscope.seen = 0;
+            self.accelerometer.seen = 0;
+        }
         let stamps = self.imu_stamps.see(stamp, "IMU", self.imu.max_gap);
         let gyroscope = self.gyroscope.see(stamp, sample.angular_velocity, "gyroscope");
         let accelerometer = self.accelerometer.see(stamp, sample.specific_force, "accelerometer");
         let implausible = self.implausible(sample);
         stamps.into_iter().chain(gyroscope).chain(accelerometer).chain(implausible)
+    }
+
+    /// Whether the IMU was unusually noisy shortly before.
+    pub fn is_noisy(&self, stamp: Stamp) -> bool {
+        let alarms = [&self.gyroscope.alarm, &self.accelerometer.alarm];
+        let recent = |last: Stamp| stamp.seconds_since(last) < NOISE_MEMORY;
+        alarms.into_iter().filter_map(|alarm| alarm.last).any(recent)
     }
 
     /// Tells of readings that are none of a body on earth.
