@@ -76,7 +76,6 @@ pub fn run(args: &FaultsArgs) -> anyhow::Result<()> {
 /// A failed run is an outcome; what prevents all of them is an error.
 fn outcome(args: &FaultsArgs, fault: Option<&Fault>) -> anyhow::Result<FaultOutcome> {
     let summary = dataset::detect(&args.log)?;
-    let overrides = args.settings.overrides();
     let file = args.config.as_deref();
     let config = Config::for_log(&summary, file, args.settings.overrides())?;
     let config_origin =

@@ -327,7 +327,7 @@ mod tests {
         for k in 0..2000 {
             let t = k as f64 * 0.005;
             let noise = if (1000..1100).contains(&k) { 0.2 } else { 0.02 };
-            let motion = if k > 500 { 3.0 * (6.0 * t).sin() } else { 0.0 };
+            let motion = if k > 500 { 3.0 * (6.0 * (t - 2.5)).sin().powi(2) } else { 0.0 };
             let alternating = if k % 2 == 0 { noise } else { -noise };
             let value = Vector3::new(motion + alternating, 0.0, 9.8);
             told.extend(level.see(at(t), value, "accelerometer").map(|_| k));
@@ -349,7 +349,7 @@ mod tests {
             watch.agreement(at(0.0), seen, state).map(|note| note.text).collect()
         };
         assert!(told(90, false, &state).is_empty());
-        assert!(told(40, false, &state)[0].contains("40 of 100 matches"));
+        assert!(told(40, false, &state)[0].contains("40 of 100 agree"));
         assert!(told(40, true, &state)[0].contains("contradict"));
         state.gyro_bias.z = -6.0 * ImuConfig::default().gyro_bias_sd;
         assert!(told(90, false, &state)[0].contains("unusual bias"));
