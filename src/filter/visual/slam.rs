@@ -353,13 +353,10 @@ impl SlamFilter {
     fn shift(&mut self, change: &DVector<f64>) {
         let part = |start: usize| change.fixed_rows::<3>(start).into_owned();
         let navigation = change.fixed_rows::<NAVIGATION>(0).into_owned();
-        let before = self.belief.state.world_from_body;
         self.belief.state = self.belief.state.corrected_by(&navigation);
-        let correction = self.belief.state.world_from_body * before.inverse();
         let base = self.base();
         for (slot, point) in self.points.iter_mut().enumerate() {
             point.position += part(base + 3 * slot);
-            point.entered_at = correction * point.entered_at;
         }
         let row = self.calibration_rows().start;
         if let Some(calibration) = &mut self.calibration {
