@@ -104,14 +104,19 @@ const fn step_of(exponents: [usize; 3]) -> usize {
 
 pub(super) fn pass<const THIRD: bool>(sums: &Sums) -> EvenMoments {
     let moments = if THIRD { series::<CUBICS>(sums) } else { series::<UP_TO_SECOND>(sums) };
-    let log_gauss: f64 = sums.a.iter().map(|a| a.ln()).sum();
     EvenMoments {
-        log_c_scaled: moments[0].ln() - 0.5 * ((8.0 * std::f64::consts::PI).ln() + log_gauss),
+        log_c_scaled: if THIRD { log_constant(sums, moments[0]) } else { 0.0 },
         squares: FIRST_STEPS.map(|n| moments[n] / moments[0]),
         products: SECOND_STEPS.map(|row| row.map(|n| moments[n] / moments[0])),
         cubics: CUBIC_STEPS.map(|n| moments[n] / moments[0]),
         basis: Basis::Squares,
     }
+}
+
+/// `log(c(S) exp(-tr S))` from `E[(1 - r^2)^(-1/2)]`.
+fn log_constant(sums: &Sums, expectation: f64) -> f64 {
+    let log_gauss: f64 = sums.a.iter().map(|a| a.ln()).sum();
+    expectation.ln() - 0.5 * ((8.0 * std::f64::consts::PI).ln() + log_gauss)
 }
 
 /// `E[x^(2 e) (1 - r^2)^(-1/2)]` for the first `N` steps, the rest zero.

@@ -40,7 +40,7 @@ impl Sums {
 /// Moments of the squared quaternion components; `ORDER` 2 or 3.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct EvenMoments {
-    /// Logarithm of `c(S) exp(-tr S)`.
+    /// Logarithm of `c(S) exp(-tr S)`; to be relied on with the cubic moments only.
     pub log_c_scaled: f64,
     /// `E[x_i^2]`, `i = 1, 2, 3`, each accurate in relative terms.
     pub squares: [f64; 3],

@@ -140,6 +140,7 @@ fn run_memoryless(trial: &mut Trial, case: &'static str, scene: &Scene) -> Resul
 /// What a filter said on its way through a scene.
 #[derive(Debug, Default)]
 struct Log {
+    /// After each step; so are the biases, rad/s.
     attitudes: Vec<Rotation3<f64>>,
     biases: Vec<Vector3<f64>>,
     attitude_nees: Vec<f64>,
@@ -156,9 +157,12 @@ const TIMED_BLOCK: usize = 64;
 /// Runs a filter over a scene; an error comes with the number of the step.
 fn follow(filter: &mut dyn BayesFilter, scene: &Scene) -> Result<Log, (usize, FilterError)> {
     let count = scene.steps.len();
-    let mut log = Log::default();
-    log.attitudes.reserve(count);
-    log.biases.reserve(count);
+    // Written to before the clock runs, or the first filter would pay for its pages.
+    let mut log = Log {
+        attitudes: vec![Rotation3::identity(); count],
+        biases: vec![Vector3::zeros(); count],
+        ..Log::default()
+    };
     let interval = (count / 2 / CONSISTENCY_INSTANTS).max(TIMED_BLOCK);
     let mut k = 0;
     while k < count {
@@ -204,8 +208,8 @@ impl Log {
             Some(Modelled::Attitude(attitude)) => filter.update_attitude(attitude)?,
             None => {}
         }
-        self.attitudes.push(filter.attitude());
-        self.biases.push(filter.gyro_bias().unwrap_or_default());
+        self.attitudes[k] = filter.attitude();
+        self.biases[k] = filter.gyro_bias().unwrap_or_default();
         Ok(())
     }
 
