@@ -5,7 +5,7 @@ mod support;
 use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, OnceLock};
+use std::sync::OnceLock;
 
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{LogConfig, open};
