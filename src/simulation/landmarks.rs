@@ -169,6 +169,8 @@ mod tests {
         let scene = LandmarkScene::draw(&config, &mut ChaCha8Rng::seed_from_u64(1));
         assert_eq!((scene.imu.len(), scene.truth.len(), scene.frames.len()), (801, 801, 40));
         assert_eq!(scene.frames[0].sample, 20);
+        let [first, second] = [0, 1].map(|sample| scene.truth[sample].velocity);
+        assert!((second - first).norm() < 0.01 * first.norm(), "the drive starts in motion");
         let (mut squares, mut count) = (0.0, 0.0);
         for frame in &scene.frames {
             let pose = scene.truth[frame.sample].world_from_body;

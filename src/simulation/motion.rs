@@ -255,9 +255,10 @@ impl Pace {
 
     fn at(&self, t: f64) -> Jet {
         let since = t - self.standstill;
-        if since <= 0.0 {
+        if since < 0.0 {
             return [0.0; 3];
         }
+        // Without a ramp the motion has its pace from the first instant.
         if since >= self.ramp {
             return [self.speed * (since - 0.5 * self.ramp), self.speed, 0.0];
         }
