@@ -41,7 +41,7 @@ fn inverse_of_positive(m: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     let determinant = a * aa + b * ab + c * ac;
     // An infinite or undefined entry makes one of these false.
     let positive = a > 0.0 && cc > 0.0 && determinant > 0.0 && determinant.is_finite();
-    let inverse = Matrix3::new(aa, ab, ac, ab, bb, bc, ac, bc, cc) / determinant;
+    let inverse = Matrix3::new(aa, ab, ac, ab, bb, bc, ac, bc, cc) * determinant.recip();
     (positive && inverse.iter().all(|x| x.is_finite())).then_some(inverse)
 }
 
@@ -95,52 +95,18 @@ impl PoseInformation {
         position: &Vector3<f64>,
         kernel: RobustKernel,
     ) -> Self {
-        let mut sum = Self {
-            origin: *position,
-            joint: JointInformation {
-                rr: SMatrix::zeros(),
-                rx: SMatrix::zeros(),
-                xx: Matrix3::zeros(),
-                eta_r: SVector::zeros(),
-                eta_x: Vector3::zeros(),
-            },
-            constant: 0.0,
-            points: 0,
-        };
+        let mut sums = PointSums::default();
         for pair in pairs {
             if let Some(weight) = pair.weight(world_from_body.matrix()) {
                 let target = pair.in_world - position;
                 let residual = world_from_body * pair.in_body - target;
                 let distance = residual.dot(&(weight * residual));
                 if distance.is_finite() {
-                    sum.add(&pair.in_body, &target, &(weight * kernel.weight(distance)));
+                    sums.add(&pair.in_body, &target, &(weight * kernel.weight(distance)));
                 }
             }
         }
-        sum
-    }
-
-    fn add(&mut self, in_body: &Vector3<f64>, target: &Vector3<f64>, weight: &Matrix3<f64>) {
-        let weighted = weight * target;
-        for a in 0..3 {
-            for b in a..3 {
-                let block = weight * (in_body[a] * in_body[b]);
-                let mut upper = self.joint.rr.fixed_view_mut::<3, 3>(3 * a, 3 * b);
-                upper += block;
-                if a != b {
-                    let mut lower = self.joint.rr.fixed_view_mut::<3, 3>(3 * b, 3 * a);
-                    lower += block;
-                }
-            }
-            let mut rx = self.joint.rx.fixed_view_mut::<3, 3>(3 * a, 0);
-            rx += weight * in_body[a];
-            let mut eta = self.joint.eta_r.fixed_rows_mut::<3>(3 * a);
-            eta += weighted * in_body[a];
-        }
-        self.joint.xx += weight;
-        self.joint.eta_x += weighted;
-        self.constant += target.dot(&weighted);
-        self.points += 1;
+        sums.form(*position)
     }
 
     /// The form's value, i.e. the weighted sum of squared residuals, at a pose.
@@ -188,6 +154,68 @@ impl PoseInformation {
             .fixed_rows_mut::<3>(3)
             .copy_from(&(self.joint.eta_x - self.joint.rx.transpose() * r));
         (information, vector)
+    }
+}
+
+/// The products `u_a u_b`, `a <= b`, of `u = (p', 1)`, in the order of [`PointSums::weights`].
+const PRODUCTS: [(usize, usize); 10] =
+    [(0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3)];
+
+/// What a quadratic form in `(r, t)` needs of its points: each weight matrix has six different
+/// entries and each `J_i` consists of the numbers `u = (p', 1)`, which makes 60 sums instead of the
+/// 144 of the information matrix.
+#[derive(Default)]
+struct PointSums {
+    /// Sums of `u_a u_b W`, the six entries of `W` row by row.
+    weights: [[f64; 6]; PRODUCTS.len()],
+    /// Sums of `u_a W p`.
+    targets: [Vector3<f64>; 4],
+    /// Sum of `p^T W p`.
+    constant: f64,
+    points: usize,
+}
+
+impl PointSums {
+    fn add(&mut self, in_body: &Vector3<f64>, target: &Vector3<f64>, weight: &Matrix3<f64>) {
+        let u = [in_body.x, in_body.y, in_body.z, 1.0];
+        let w = [weight.m11, weight.m12, weight.m13, weight.m22, weight.m23, weight.m33];
+        for (sums, (a, b)) in self.weights.iter_mut().zip(PRODUCTS) {
+            let product = u[a] * u[b];
+            for (sum, entry) in sums.iter_mut().zip(w) {
+                *sum += product * entry;
+            }
+        }
+        let weighted = weight * target;
+        for (sum, u) in self.targets.iter_mut().zip(u) {
+            *sum += weighted * u;
+        }
+        self.constant += target.dot(&weighted);
+        self.points += 1;
+    }
+
+    fn form(&self, origin: Vector3<f64>) -> PoseInformation {
+        let mut joint = JointInformation {
+            rr: SMatrix::zeros(),
+            rx: SMatrix::zeros(),
+            xx: Matrix3::zeros(),
+            eta_r: SVector::zeros(),
+            eta_x: self.targets[3],
+        };
+        for (w, (a, b)) in self.weights.iter().zip(PRODUCTS) {
+            let block = Matrix3::new(w[0], w[1], w[2], w[1], w[3], w[4], w[2], w[4], w[5]);
+            match (a, b) {
+                (3, _) => joint.xx = block,
+                (_, 3) => joint.rx.fixed_view_mut::<3, 3>(3 * a, 0).copy_from(&block),
+                _ => {
+                    joint.rr.fixed_view_mut::<3, 3>(3 * a, 3 * b).copy_from(&block);
+                    joint.rr.fixed_view_mut::<3, 3>(3 * b, 3 * a).copy_from(&block);
+                }
+            }
+        }
+        for a in 0..3 {
+            joint.eta_r.fixed_rows_mut::<3>(3 * a).copy_from(&self.targets[a]);
+        }
+        PoseInformation { origin, joint, constant: self.constant, points: self.points }
     }
 }
 
