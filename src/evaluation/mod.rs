@@ -36,6 +36,7 @@ pub use figures::{
     stage_times_figure, trajectory_figure,
 };
 pub use guards::{Convention, Suspicion, Which, similarity_scale, suspicions};
+pub(crate) use nees::is_vertical;
 pub use nees::{
     BelievedTrajectory, NeesOptions, NeesResult, NeesSummary, nees, normalised_square,
     read_believed_trajectory,

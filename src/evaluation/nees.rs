@@ -122,6 +122,11 @@ const KNOWN_ATTITUDE: f64 = 0.2;
 /// Verticals of two worlds that differ by more than this are not the same, degrees.
 const SAME_VERTICAL_DEG: f64 = 5.0;
 
+/// Whether what is up in one world is up in the other.
+pub(crate) fn is_vertical(up: &Vector3<f64>) -> bool {
+    up.angle(&Vector3::z()).to_degrees() < SAME_VERTICAL_DEG
+}
+
 impl NeesOptions {
     /// For an estimate whose vertical is that of gravity: heading and position of the first poses
     /// are put on each other, but not roll and pitch, whose error at the start is no property of
@@ -136,9 +141,8 @@ impl NeesOptions {
             .into_iter()
             .map(|(r, e)| (estimate.poses()[e].rotation, reference.poses()[r].rotation))
             .fold(Vector3::zeros(), |sum, (e, r)| sum + e * (r.inverse() * Vector3::z()));
-        let same = up.angle(&Vector3::z()).to_degrees() < SAME_VERTICAL_DEG;
         let (alignment, align_n) =
-            if same { (Alignment::Yaw, Some(1)) } else { (Alignment::Origin, None) };
+            if is_vertical(&up) { (Alignment::Yaw, Some(1)) } else { (Alignment::Origin, None) };
         Ok(Self { association, alignment, align_n, ..Self::default() })
     }
 }

@@ -145,7 +145,8 @@ impl NoiseLevel {
 pub(super) struct SensorWatch {
     imu: ImuConfig,
     imu_stamps: Regularity,
-    /// Magnitude of the specific force, averaged over [`FORCE_TIME`], and the time of it.
+    /// Magnitude of the specific force, averaged over [`FORCE_TIME`], and the time of it; `None`
+    /// before the first sample.
     force: Option<(Stamp, f64)>,
     units: Alarm,
     gyroscope: NoiseLevel,
@@ -271,7 +272,9 @@ impl SensorWatch {
         });
         let beyond = |bias: f64, sd: f64| sd > 0.0 && bias > UNUSUAL_BIAS * sd;
         let (gyro, accel) = (state.gyro_bias.amax(), state.accel_bias.amax());
-        let unusual = beyond(gyro, self.imu.gyro_bias_sd) || beyond(accel, self.imu.accel_bias_sd);
+        // Without an IMU the biases carry the motion of the constant-velocity model.
+        let unusual = self.force.is_some()
+            && (beyond(gyro, self.imu.gyro_bias_sd) || beyond(accel, self.imu.accel_bias_sd));
         let bias = self.bias.tell(stamp, unusual, || {
             format!(
                 "unusual bias at {stamp} s: gyroscope {gyro:.3} rad/s, accelerometer {accel:.2} \
@@ -338,6 +341,12 @@ mod tests {
     #[test]
     fn disagreement_contradiction_and_biases_are_named() {
         let mut watch = SensorWatch::new(&ImuConfig::default());
+        let sample = ImuSample {
+            stamp: at(0.0),
+            angular_velocity: Vector3::zeros(),
+            specific_force: Vector3::z() * ImuConfig::default().gravity,
+        };
+        assert_eq!(watch.imu(&sample).count(), 0);
         let mut state = NavState {
             world_from_body: nalgebra::Isometry3::identity(),
             velocity: Vector3::zeros(),
@@ -353,5 +362,9 @@ mod tests {
         assert!(told(40, true, &state)[0].contains("contradict"));
         state.gyro_bias.z = -6.0 * ImuConfig::default().gyro_bias_sd;
         assert!(told(90, false, &state)[0].contains("unusual bias"));
+
+        let mut without_imu = SensorWatch::new(&ImuConfig::default());
+        let seen = Agreement { matches: 100, inliers: 90, contradicted: false };
+        assert_eq!(without_imu.agreement(at(0.0), seen, &state).count(), 0);
     }
 }

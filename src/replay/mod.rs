@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use nalgebra::{Isometry3, Matrix6};
+use nalgebra::{Isometry3, Matrix6, UnitQuaternion, Vector3};
 
 pub use attitude::{AttitudeMetrics, AttitudeRequest, Reached, replay_attitude};
 pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors};
@@ -25,7 +25,7 @@ pub use report::{Series, figures, report};
 
 use crate::config::Config;
 use crate::dataset::{self, Fault, Log, LogError, ReadReport};
-use crate::evaluation::{EvaluationError, Trajectory, read_trajectory};
+use crate::evaluation::{EvaluationError, Similarity, Trajectory, is_vertical, read_trajectory};
 use crate::filter::{FilterKind, pose_covariance};
 use crate::inertial::{ImuSample, Stamp};
 use crate::odometry::{
@@ -81,8 +81,8 @@ pub struct Request<'a> {
 
 /// Sees every frame with its report while a replay runs.
 pub trait Observer {
-    /// `truth` is the reference pose at the frame, moved so that it starts where the estimate
-    /// starts.
+    /// `truth` is the reference pose at the frame, its world moved so that it starts where the
+    /// estimate starts; where both worlds are z-up without tilting it.
     fn frame(&mut self, report: &StepReport, frame: &RgbdFrame, truth: Option<&Isometry3<f64>>);
 
     /// A sample as it is read, biases and noise included.
@@ -146,6 +146,7 @@ pub fn replay(
         covariances: Vec::new(),
         estimate_from_reference: None,
         truth_max_gap: config.truth.max_gap,
+        levelled: summary.has_imu,
     };
     let mut truth = Vec::new();
     let given = request.truth.as_deref().map(given_truth).transpose()?;
@@ -370,6 +371,25 @@ struct Session {
     /// Moves the reference to where the estimate starts; fixed at the first frame that has both.
     estimate_from_reference: Option<Isometry3<f64>>,
     truth_max_gap: f64,
+    /// Whether gravity makes the estimate's world z-up.
+    levelled: bool,
+}
+
+/// Puts the reference's world on the estimate's by a pose of both: heading and position where both
+/// are z-up, since the tilt of the estimate is then an error of its own, else the whole pose.
+fn estimate_from_reference(
+    estimate: &Isometry3<f64>,
+    reference: &Isometry3<f64>,
+    levelled: bool,
+) -> Isometry3<f64> {
+    let whole = estimate * reference.inverse();
+    if !(levelled && is_vertical(&(whole.rotation * Vector3::z()))) {
+        return whole;
+    }
+    let turn = Similarity { rotation: whole.rotation, ..Similarity::identity() };
+    let heading = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn.yaw());
+    let position = estimate.translation.vector - heading * reference.translation.vector;
+    Isometry3::from_parts(position.into(), heading)
 }
 
 impl Session {
@@ -397,7 +417,8 @@ impl Session {
         }
         let reference = odometry.truth().at(report.stamp, self.truth_max_gap);
         if let (Some(reference), None) = (reference, self.estimate_from_reference) {
-            self.estimate_from_reference = Some(estimate * reference.inverse());
+            self.estimate_from_reference =
+                Some(estimate_from_reference(&estimate, &reference, self.levelled));
         }
         let moved = self.estimate_from_reference.zip(reference).map(|(by, pose)| by * pose);
         for observer in observers {
