@@ -58,9 +58,9 @@ def bars(report):
     quantities = list(dict.fromkeys(r["quantity"] for r in report["rows"] if r["paper"] is not None))
     if not quantities:
         return ""
-    figure, axes = plt.subplots(
-        1, len(quantities), figsize=(3.2 * len(quantities), 3.0), squeeze=False
-    )
+    most = max(sum(r["quantity"] == q for r in report["rows"]) for q in quantities)
+    size = (3.2 * len(quantities), max(3.0, 1.0 + 0.14 * most))  # a line of text a row
+    figure, axes = plt.subplots(1, len(quantities), figsize=size, squeeze=False)
     for axis, quantity in zip(axes[0], quantities):
         rows = [r for r in report["rows"] if r["quantity"] == quantity]
         labels = [f"{r['case']} {r['filter']}" for r in rows]
