@@ -15,7 +15,8 @@ use mfg_vio::replay::{FaultOutcome, fault_grid};
 ///
 /// The table says of each fault whether poses and covariances stayed valid, when and how the
 /// event log named it, how long vision was lost, and error and NEES from a second after its end
-/// on (3 is consistent), the first poses of run and reference being put on each other.
+/// on (3 is consistent), heading and position of the first poses of run and reference being put on
+/// each other.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  mfg-vio simulate --out lab.mcap --duration 15\n  \
                         mfg-vio faults lab.mcap --at 5\n  \

@@ -69,7 +69,7 @@ pub struct Naming {
     pub text: String,
 }
 
-/// Errors after the fault, the first poses of the run being put on each other.
+/// Errors after the fault, heading and position of the first poses being put on each other.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Recovered {
     /// Root mean square, m.
