@@ -607,7 +607,6 @@ impl Running {
         let seconds = stamp.seconds_since(since);
         let text =
             format!("attitude found after {seconds:.2} s: roll and pitch known to {sd:.1} deg");
-        tracing::info!("{text}");
         Some(Note { level: NoteLevel::Info, text })
     }
 

@@ -130,7 +130,7 @@ pub fn navigate(
         let sample = scaled(&config.imu, sample);
         run.count(&now, &sample);
         while let Some(fix) = waiting.next_if(|fix| fix.stamp <= sample.stamp) {
-            let at_fix = interpolate(&now, &sample, fix.stamp);
+            let at_fix = ImuSample::between(&now, &sample, fix.stamp);
             run.advance(&now, &at_fix)?;
             now = at_fix;
             if observe(&run.fix(fix)?).is_break() {
@@ -181,7 +181,8 @@ fn find_start<'a>(
         let after = imu.partition_point(|sample| sample.stamp <= fix.stamp);
         let (Some(before), Some(next)) = (imu[..after].last(), imu.get(after)) else { continue };
         if next.stamp.seconds_since(before.stamp) <= config.max_gap {
-            let origin = interpolate(&scaled(config, before), &scaled(config, next), fix.stamp);
+            let origin =
+                ImuSample::between(&scaled(config, before), &scaled(config, next), fix.stamp);
             return Ok(Start { origin, samples: &imu[after..], fixes: &fixes[number..] });
         }
     }
@@ -205,17 +206,6 @@ fn scaled(config: &ImuConfig, sample: &ImuSample) -> ImuSample {
         stamp: sample.stamp,
         angular_velocity: sample.angular_velocity * config.gyroscope_scale,
         specific_force: sample.specific_force * config.accelerometer_scale,
-    }
-}
-
-/// The IMU at a stamp between two samples.
-fn interpolate(a: &ImuSample, b: &ImuSample, stamp: Stamp) -> ImuSample {
-    let length = b.stamp.seconds_since(a.stamp);
-    let share = if length > 0.0 { stamp.seconds_since(a.stamp) / length } else { 0.0 };
-    ImuSample {
-        stamp,
-        angular_velocity: a.angular_velocity.lerp(&b.angular_velocity, share),
-        specific_force: a.specific_force.lerp(&b.specific_force, share),
     }
 }
 
