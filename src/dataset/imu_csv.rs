@@ -1,14 +1,13 @@
 //! Inertial data as CSV: `t,gx,gy,gz,ax,ay,az[,mx,my,mz]` in SI units, with or without a line of
 //! column names.
 
-use std::fs::File;
-use std::io::{BufRead, BufReader, Lines};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use nalgebra::Vector3;
 
 use super::LogError;
-use crate::inertial::{ImuSample, Stamp};
+use super::text_table::{Row, TextTable, fields};
+use crate::inertial::ImuSample;
 
 const COLUMNS: [&str; 10] = ["t", "gx", "gy", "gz", "ax", "ay", "az", "mx", "my", "mz"];
 /// Columns that must be there.
@@ -29,9 +28,7 @@ pub struct ImuRow {
 /// lines and lines that begin with `#` are left out. After an error there are no more rows.
 #[derive(Debug)]
 pub struct ImuCsv {
-    path: PathBuf,
-    lines: Lines<BufReader<File>>,
-    number: usize,
+    table: TextTable,
     /// Position of each of [`COLUMNS`]; found at the first line.
     positions: Option<Vec<usize>>,
     failed: bool,
@@ -41,30 +38,16 @@ impl ImuCsv {
     /// # Errors
     /// [`LogError::Io`] if the file cannot be opened.
     pub fn open(path: &Path) -> Result<Self, LogError> {
-        let file =
-            File::open(path).map_err(|source| LogError::Io { path: path.to_path_buf(), source })?;
-        Ok(Self {
-            path: path.to_path_buf(),
-            lines: BufReader::new(file).lines(),
-            number: 0,
-            positions: None,
-            failed: false,
-        })
+        Ok(Self { table: TextTable::open(path)?, positions: None, failed: false })
     }
 
     fn next_row(&mut self) -> Result<Option<ImuRow>, LogError> {
-        for line in self.lines.by_ref() {
-            self.number += 1;
-            let line = line.map_err(|error| match error.kind() {
-                std::io::ErrorKind::InvalidData => corrupt(&self.path, self.number, "not text"),
-                _ => LogError::Io { path: self.path.clone(), source: error },
-            })?;
-            let line = line.trim_start_matches('\u{feff}').trim();
-            if line.is_empty() || line.starts_with('#') {
+        while let Some(line) = self.table.next_line()? {
+            if line.starts_with('#') {
                 continue;
             }
-            let here = |reason: String| corrupt(&self.path, self.number, &reason);
-            let fields: Vec<&str> = line.split(',').map(str::trim).collect();
+            let here = |reason: String| self.table.wrong_line(&reason);
+            let fields = fields(&line);
             let positions = match &self.positions {
                 Some(positions) => positions,
                 None => {
@@ -77,7 +60,7 @@ impl ImuCsv {
                     positions
                 }
             };
-            return row(&fields, positions).map(Some).map_err(here);
+            return row(&Row(&fields), positions).map(Some).map_err(here);
         }
         Ok(None)
     }
@@ -94,10 +77,6 @@ impl Iterator for ImuCsv {
         self.failed = next.is_err();
         next.transpose()
     }
-}
-
-fn corrupt(path: &Path, line: usize, reason: &str) -> LogError {
-    LogError::Corrupt { path: path.to_path_buf(), reason: format!("line {line}: {reason}") }
 }
 
 fn by_name(names: &[&str]) -> Result<Vec<usize>, String> {
@@ -123,24 +102,22 @@ fn in_order(fields: &[&str]) -> Result<Vec<usize>, String> {
     }
 }
 
-fn row(fields: &[&str], positions: &[usize]) -> Result<ImuRow, String> {
-    let field = |column: usize| {
-        let text = positions.get(column).and_then(|position| fields.get(*position));
-        text.copied().ok_or_else(|| format!("{} fields are too few", fields.len()))
+/// `positions` are those of the time, of the inertial columns and perhaps of the magnetometer.
+fn row(row: &Row, positions: &[usize]) -> Result<ImuRow, String> {
+    let (inertial, magnetic) = positions.split_at(INERTIAL_COLUMNS.min(positions.len()));
+    let &[t, gx, gy, gz, ax, ay, az] = inertial else {
+        return Err(format!("{} columns are too few", positions.len()));
     };
-    let number = |column: usize| {
-        let text = field(column)?;
-        text.parse::<f64>().map_err(|_| format!("`{text}` is no number"))
+    let imu = ImuSample {
+        stamp: row.stamp(t)?,
+        angular_velocity: row.vector([gx, gy, gz])?,
+        specific_force: row.vector([ax, ay, az])?,
     };
-    let vector = |column: usize| -> Result<Vector3<f64>, String> {
-        Ok(Vector3::new(number(column)?, number(column + 1)?, number(column + 2)?))
+    let measured = |column: &usize| row.field(*column).is_ok_and(|text| !text.is_empty());
+    let magnetic_field = match magnetic {
+        &[x, y, z] if magnetic.iter().all(measured) => Some(row.vector([x, y, z])?),
+        _ => None,
     };
-    let time = field(0)?;
-    let stamp = Stamp::parse_seconds(time).ok_or_else(|| format!("`{time}` is no time in s"))?;
-    let imu = ImuSample { stamp, angular_velocity: vector(1)?, specific_force: vector(4)? };
-    let has_field = positions.len() == COLUMNS.len();
-    let measured = has_field && (7..10).all(|column| field(column).is_ok_and(|t| !t.is_empty()));
-    let magnetic_field = if measured { Some(vector(7)?) } else { None };
     Ok(ImuRow { imu, magnetic_field })
 }
 

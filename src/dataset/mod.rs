@@ -29,6 +29,7 @@ mod samples;
 mod section;
 mod seven_scenes;
 mod stereo;
+mod text_table;
 mod tum;
 mod write;
 
@@ -44,6 +45,6 @@ pub use inspect::{
     GyroscopeUnit, ImuInspection, Inspection, LogClock, PairInspection, Severity, Sign, Timing,
     TopicInspection, Verdict, inspect,
 };
-pub use navigation_csv::{TableError, read_imu_table, read_position_table};
+pub use navigation_csv::{read_imu_table, read_position_table};
 pub use open::{detect, open, open_with_faults};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

@@ -11,11 +11,13 @@
 //! | specific force, m/s^2 | `ax ay az`, `accelX accelY accelZ`, `acc_x ...`, `accel_x ...` |
 //! | position, m, z up | `x y z`, `px py pz`, `tx ty tz`, `east north up` |
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use nalgebra::Vector3;
 
-use crate::inertial::{ImuSample, PositionFix, Stamp};
+use super::LogError;
+use super::text_table::{Row, TextTable, fields};
+use crate::inertial::{ImuSample, PositionFix};
 
 const STAMP: &[&str] = &["t", "time", "timestamp", "stamp"];
 const RATE: &[[&str; 3]] = &[
@@ -34,139 +36,98 @@ const FORCE: &[[&str; 3]] = &[
 const POSITION: &[[&str; 3]] =
     &[["x", "y", "z"], ["px", "py", "pz"], ["tx", "ty", "tz"], ["east", "north", "up"]];
 
-/// Why a table cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum TableError {
-    #[error("{path}: {source}")]
-    Io { path: PathBuf, source: std::io::Error },
-    #[error("{path}: is empty; its first line must name the columns")]
-    Empty { path: PathBuf },
-    #[error("{path}: no column for the {what}; expected one of {expected}, found {found}")]
-    NoColumn { path: PathBuf, what: &'static str, expected: String, found: String },
-    #[error("{path}, line {line}: {reason}")]
-    Line { path: PathBuf, line: usize, reason: String },
-}
-
 /// IMU samples in the order of the file.
-pub fn read_imu_table(path: &Path) -> Result<Vec<ImuSample>, TableError> {
-    let text = read(path)?;
-    let table = Table::new(path, &text)?;
+///
+/// # Errors
+/// [`LogError::Io`], or [`LogError::Corrupt`] with the column that is missing or the line that is
+/// wrong.
+pub fn read_imu_table(path: &Path) -> Result<Vec<ImuSample>, LogError> {
+    let mut table = NamedTable::open(path)?;
     let stamp = table.column("stamp", STAMP)?;
     let rate = table.columns("angular velocity", RATE)?;
     let force = table.columns("specific force", FORCE)?;
-    table.read(|row| {
+    table.rows(|row| {
         Ok(ImuSample {
             stamp: row.stamp(stamp)?,
-            angular_velocity: row.vector(rate)?,
-            specific_force: row.vector(force)?,
+            angular_velocity: finite(row, rate)?,
+            specific_force: finite(row, force)?,
         })
     })
 }
 
 /// Position fixes in the order of the file.
-pub fn read_position_table(path: &Path) -> Result<Vec<PositionFix>, TableError> {
-    let text = read(path)?;
-    let table = Table::new(path, &text)?;
+///
+/// # Errors
+/// As [`read_imu_table`].
+pub fn read_position_table(path: &Path) -> Result<Vec<PositionFix>, LogError> {
+    let mut table = NamedTable::open(path)?;
     let stamp = table.column("stamp", STAMP)?;
     let position = table.columns("position", POSITION)?;
-    table.read(|row| Ok(PositionFix { stamp: row.stamp(stamp)?, position: row.vector(position)? }))
+    table.rows(|row| Ok(PositionFix { stamp: row.stamp(stamp)?, position: finite(row, position)? }))
 }
 
-fn read(path: &Path) -> Result<String, TableError> {
-    std::fs::read_to_string(path).map_err(|source| TableError::Io { path: path.to_owned(), source })
+fn finite(row: &Row, columns: [usize; 3]) -> Result<Vector3<f64>, String> {
+    let vector = row.vector(columns)?;
+    let bad = (0..3).find(|&i| !vector[i].is_finite());
+    bad.map_or(Ok(vector), |i| Err(format!("`{}` is no finite number", row.field(columns[i])?)))
 }
 
-/// Fields of a line; several blanks separate as one.
-fn fields(line: &str) -> Vec<&str> {
-    if line.contains([',', ';']) {
-        line.split([',', ';']).map(str::trim).collect()
-    } else {
-        line.split_whitespace().collect()
-    }
-}
-
-struct Table<'a> {
-    path: &'a Path,
+/// A table whose first line, which may begin with `#`, names the columns.
+struct NamedTable {
+    lines: TextTable,
     names: Vec<String>,
-    /// Number and text of each line that is neither empty nor a comment.
-    lines: Vec<(usize, &'a str)>,
 }
 
-impl<'a> Table<'a> {
-    fn new(path: &'a Path, text: &'a str) -> Result<Self, TableError> {
-        let text = text.trim_start_matches('\u{feff}');
-        let lines = text.lines().enumerate().map(|(number, line)| (number + 1, line.trim()));
-        let mut lines = lines.filter(|(_, line)| !line.is_empty());
-        let (_, header) =
-            lines.next().ok_or_else(|| TableError::Empty { path: path.to_owned() })?;
+impl NamedTable {
+    fn open(path: &Path) -> Result<Self, LogError> {
+        let mut lines = TextTable::open(path)?;
+        let header = lines.next_line()?.ok_or_else(|| {
+            let reason = "is empty; its first line must name the columns".to_owned();
+            LogError::Corrupt { path: path.to_path_buf(), reason }
+        })?;
         let names = fields(header.trim_start_matches(['#', ' ']));
         let names = names.iter().map(|name| name.to_lowercase()).collect();
-        let lines = lines.filter(|(_, line)| !line.starts_with('#')).collect();
-        Ok(Self { path, names, lines })
+        Ok(Self { lines, names })
     }
 
     fn position(&self, name: &str) -> Option<usize> {
         self.names.iter().position(|column| column == name)
     }
 
-    fn no_column(&self, what: &'static str, expected: Vec<String>) -> TableError {
-        let path = self.path.to_owned();
-        let found = self.names.join(" ");
-        TableError::NoColumn { path, what, expected: expected.join(", "), found }
+    fn no_column(&self, what: &str, expected: &[String]) -> LogError {
+        let (expected, found) = (expected.join(", "), self.names.join(" "));
+        let reason = format!("no column for the {what}; expected one of {expected}, found {found}");
+        self.lines.wrong_line(&reason)
     }
 
-    fn column(&self, what: &'static str, names: &[&str]) -> Result<usize, TableError> {
+    fn column(&self, what: &str, names: &[&str]) -> Result<usize, LogError> {
         let found = names.iter().find_map(|name| self.position(name));
         found.ok_or_else(|| {
-            self.no_column(what, names.iter().map(|name| format!("`{name}`")).collect())
+            let expected: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
+            self.no_column(what, &expected)
         })
     }
 
-    fn columns(&self, what: &'static str, names: &[[&str; 3]]) -> Result<[usize; 3], TableError> {
+    fn columns(&self, what: &str, names: &[[&str; 3]]) -> Result<[usize; 3], LogError> {
         let all =
             |[x, y, z]: &[&str; 3]| Some([self.position(x)?, self.position(y)?, self.position(z)?]);
         let found = names.iter().find_map(all);
         found.ok_or_else(|| {
-            self.no_column(what, names.iter().map(|n| format!("`{}`", n.join(" "))).collect())
+            let expected: Vec<String> =
+                names.iter().map(|names| format!("`{}`", names.join(" "))).collect();
+            self.no_column(what, &expected)
         })
     }
 
-    fn read<T>(&self, parse: impl Fn(&Row) -> Result<T, String>) -> Result<Vec<T>, TableError> {
-        let one = |&(line, text): &(usize, &str)| {
-            parse(&Row { fields: fields(text) }).map_err(|reason| TableError::Line {
-                path: self.path.to_owned(),
-                line,
-                reason,
-            })
-        };
-        self.lines.iter().map(one).collect()
-    }
-}
-
-struct Row<'a> {
-    fields: Vec<&'a str>,
-}
-
-impl Row<'_> {
-    fn field(&self, column: usize) -> Result<&str, String> {
-        let count = self.fields.len();
-        let missing = || format!("{count} fields, but field {} is needed", column + 1);
-        self.fields.get(column).copied().ok_or_else(missing)
-    }
-
-    fn stamp(&self, column: usize) -> Result<Stamp, String> {
-        let text = self.field(column)?;
-        Stamp::parse_seconds(text).ok_or_else(|| format!("`{text}` is no time in seconds"))
-    }
-
-    fn vector(&self, columns: [usize; 3]) -> Result<Vector3<f64>, String> {
-        let mut vector = Vector3::zeros();
-        for (value, column) in vector.iter_mut().zip(columns) {
-            let text = self.field(column)?;
-            let number: Option<f64> = text.parse().ok().filter(|x: &f64| x.is_finite());
-            *value = number.ok_or_else(|| format!("`{text}` is no finite number"))?;
+    fn rows<T>(&mut self, parse: impl Fn(&Row) -> Result<T, String>) -> Result<Vec<T>, LogError> {
+        let mut rows = Vec::new();
+        while let Some(line) = self.lines.next_line()? {
+            if !line.starts_with('#') {
+                let row = parse(&Row(&fields(&line)));
+                rows.push(row.map_err(|reason| self.lines.wrong_line(&reason))?);
+            }
         }
-        Ok(vector)
+        Ok(rows)
     }
 }
 
