@@ -7,10 +7,10 @@ use std::sync::LazyLock;
 /// whose smallest term there is `exp(-2 t) < 1e-20`.
 const TABLE_END: f64 = 24.0;
 /// Nodes of the table for each unit of concentration.
-const NODES_PER_UNIT: f64 = 4.0;
-const NODES: usize = 97;
-/// Taylor terms at each node: `(2/8)^n / n!` is below rounding for `n = 12`.
-const TAYLOR: usize = 12;
+const NODES_PER_UNIT: f64 = 16.0;
+const NODES: usize = 385;
+/// Taylor terms at each node: `(2/32)^n / n!` is below rounding for `n = 9`.
+const TAYLOR: usize = 9;
 /// Terms of the asymptotic series at the end of the table.
 const ASYMPTOTIC: usize = 30;
 
@@ -46,9 +46,9 @@ impl CircleMoments {
         Self { scaled_i0: 1.0, cosine: [1.0, 0.0, 0.5, 0.0], half_versine: [0.5, 0.375] };
 
     fn from_table<const THIRD: bool>(t: f64) -> Self {
-        let node = (t * NODES_PER_UNIT).round();
-        let offset = node / NODES_PER_UNIT - t;
-        let [i0, i1_over_t, i2_over_t2] = TABLE.get(node as usize).unwrap_or(&TABLE[NODES - 1]);
+        let node = ((t * NODES_PER_UNIT + 0.5) as usize).min(NODES - 1);
+        let offset = node as f64 / NODES_PER_UNIT - t;
+        let [i0, i1_over_t, i2_over_t2] = &TABLE[node];
         let series = |f: &[f64; TAYLOR]| f.iter().rev().fold(0.0, |sum, c| sum * offset + c);
         let i0 = series(i0);
         let squared_sine = series(i1_over_t) / i0;

@@ -28,7 +28,7 @@ use nalgebra::allocator::Allocator;
 use nalgebra::{DefaultAllocator, Dim, Matrix3, OVector, Rotation3, U1, U3, Vector3};
 
 use super::matrix_fisher::{MatrixFisher, MatrixFisherError, sums_of_singular_values};
-use super::matrix_fisher_gaussian::{Correlation, MatrixFisherGaussian, MfgError, WeightedSample};
+use super::matrix_fisher_gaussian::{MatrixFisherGaussian, WeightedSample};
 use crate::so3::{ProperSvd, exp, proper_svd};
 
 /// Steps of the bisections for the spread and for the inverse.
@@ -249,15 +249,6 @@ where
         }
         Ok(points)
     }
-
-    /// The distribution of weighted points (theorem 3.6), the inverse of
-    /// [`sigma_points`](Self::sigma_points).
-    pub fn from_sigma_points(
-        points: &[WeightedSample<D>],
-        correlation: Correlation,
-    ) -> Result<Self, MfgError> {
-        Self::from_samples(points, correlation)
-    }
 }
 
 /// The mode with `centre`, and each pair of turns about the principal axes with twice its weight.
@@ -334,6 +325,7 @@ mod tests {
     use nalgebra::{Const, OMatrix};
     use proptest::prelude::*;
 
+    use super::super::matrix_fisher_gaussian::Correlation;
     use super::*;
 
     fn fisher(s: [f64; 3]) -> MatrixFisher {
@@ -426,7 +418,7 @@ mod tests {
                 ).unwrap();
                 let points = belief.sigma_points(0.5, 0.4).unwrap();
                 prop_assert_eq!(points.len(), 13);
-                let found = MatrixFisherGaussian::from_sigma_points(&points, correlation).unwrap();
+                let found = MatrixFisherGaussian::from_samples(&points, correlation).unwrap();
                 prop_assert!((found.mu() - belief.mu()).norm() < 1e-10);
                 prop_assert!((found.sigma() - belief.sigma()).norm() < 1e-9);
                 let f = belief.attitude().parameter();

@@ -4,6 +4,7 @@
 pub mod attitude;
 mod bayes;
 pub mod gnss;
+mod third_moments;
 mod visual;
 
 pub use crate::alignment::MapEstimate;

@@ -104,11 +104,12 @@ const fn step_of(exponents: [usize; 3]) -> usize {
 
 pub(super) fn pass<const THIRD: bool>(sums: &Sums) -> EvenMoments {
     let moments = if THIRD { series::<CUBICS>(sums) } else { series::<UP_TO_SECOND>(sums) };
+    let scale = moments[0].recip();
     EvenMoments {
         log_c_scaled: if THIRD { log_constant(sums, moments[0]) } else { 0.0 },
-        squares: FIRST_STEPS.map(|n| moments[n] / moments[0]),
-        products: SECOND_STEPS.map(|row| row.map(|n| moments[n] / moments[0])),
-        cubics: CUBIC_STEPS.map(|n| moments[n] / moments[0]),
+        squares: FIRST_STEPS.map(|n| moments[n] * scale),
+        products: SECOND_STEPS.map(|row| row.map(|n| moments[n] * scale)),
+        cubics: if THIRD { CUBIC_STEPS.map(|n| moments[n] * scale) } else { [0.0; CUBICS] },
         basis: Basis::Squares,
     }
 }
@@ -133,19 +134,33 @@ fn series<const N: usize>(sums: &Sums) -> [f64; CUBICS] {
     for (n, coefficient) in gauss.iter().take(terms).enumerate() {
         running[0] = *coefficient;
         totals[0] += weight * coefficient;
-        for (m, step) in STEPS.iter().enumerate().take(N).skip(1) {
+        // Of constant length, so that it is unrolled and the table folded into the code.
+        for (m, step) in (1..).zip(&STEPS[1..N]) {
             running[m] = running[step.parent] + v[step.axis] * running[m];
             totals[m] += weight * running[m];
         }
         weight *= n as f64 + 0.5;
     }
     let mut scale = [1.0; CUBICS];
-    for (m, step) in STEPS.iter().enumerate().take(N).skip(1) {
+    for (m, step) in (1..).zip(&STEPS[1..N]) {
         let factor = step.exponents[step.axis] as f64 - 0.5;
         scale[m] = scale[step.parent] * factor * v[step.axis];
         totals[m] *= scale[m];
     }
     totals
+}
+
+/// `1/(2n)`.
+const HALVES: [f64; MAX_TERMS] = halves();
+
+const fn halves() -> [f64; MAX_TERMS] {
+    let mut list = [0.0; MAX_TERMS];
+    let mut n = 1;
+    while n < MAX_TERMS {
+        list[n] = 0.5 / n as f64;
+        n += 1;
+    }
+    list
 }
 
 /// Terms until they are negligible for the highest moment, from the ratio of successive terms
@@ -172,8 +187,11 @@ fn gaussian_coefficients(v: &[f64; 3], terms: usize) -> [f64; MAX_TERMS] {
         for (power, v) in powers.iter_mut().zip(v) {
             *power *= v;
         }
-        let convolution: f64 = (1..=n).map(|m| power_sums[m] * g[n - m]).sum();
-        g[n] = convolution / (2.0 * n as f64);
+    }
+    for (n, half) in HALVES.iter().enumerate().take(terms).skip(1) {
+        // The newest factor last: only the end of the sum waits for it.
+        let factors = g[..n].iter().zip(power_sums[1..=n].iter().rev());
+        g[n] = half * factors.map(|(g, p)| g * p).sum::<f64>();
     }
     g
 }

@@ -10,12 +10,14 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::engine::Sums;
 use super::first::FirstMoments;
+use super::moments::Moments;
 
 /// Steps before giving up; at most 9 were ever needed.
 const MAX_STEPS: usize = 40;
-/// A step below this, relative to the scale of each unknown, ends the iteration: the error left
-/// is its square.
-const SMALL_STEP: f64 = 1e-7;
+/// An error below this, relative to the scale of each unknown, ends the iteration.
+const SMALL_ERROR: f64 = 1e-14;
+/// Steps below this are taken to converge quadratically, with the constant of the last two.
+const QUADRATIC: f64 = 0.1;
 /// Moments that differ by less, in the wrong order, count as equal.
 const TIE: f64 = 1e-14;
 /// Smaller moments belong to concentrations that overflow.
@@ -111,16 +113,16 @@ pub fn s_from_quaternion_squares(squares: &Vector3<f64>) -> Result<Vector3<f64>,
 }
 
 /// [`s_from_complement`] started from a neighbouring solution, as a filter has it from its last
-/// step; falls back to the cold start where that fails.
+/// step with all moments that Newton's first step needs; falls back to the cold start where that
+/// fails.
 pub fn s_from_complement_near(
     g: &Vector3<f64>,
-    neighbour: &Vector3<f64>,
+    neighbour: &Moments,
 ) -> Result<Vector3<f64>, MomentError> {
-    let start = Sums::of_singular_values(neighbour).a.map(|a| a.max(0.0));
-    s_from_complement_at(g, FirstMoments::of(Sums::new(ordered(start))))
+    s_from_complement_at(g, neighbour.up_to_second())
 }
 
-/// The same where the moments of the neighbour are known.
+/// The same from moments up to the second order.
 pub(super) fn s_from_complement_at(
     g: &Vector3<f64>,
     neighbour: FirstMoments,
@@ -155,14 +157,20 @@ fn solve(target: &[f64; 3], start: FirstMoments) -> Result<Sums, MomentError> {
     let mut size = f64::INFINITY;
     for _ in 0..MAX_STEPS {
         let Some(step) = newton_step(target, &at) else { break };
-        size = step.amax;
+        let previous = std::mem::replace(&mut size, step.amax);
         let next = ordered(std::array::from_fn(|i| limited_step(at.sums.a[i], step.da[i])));
-        if size < SMALL_STEP {
+        if error_after(size, previous) < SMALL_ERROR {
             return Ok(Sums::new(next));
         }
         at = FirstMoments::of(Sums::new(next));
     }
     Err(MomentError::NotConverged { moments: *target, step: size })
+}
+
+/// What a step leaves behind: its square, or less where the one before shows it.
+fn error_after(step: f64, previous: f64) -> f64 {
+    let constant = if previous < QUADRATIC { step / (previous * previous) } else { 1.0 };
+    constant.min(1.0) * step * step
 }
 
 /// Sums are not negative, and one step does not leap from concentrated to diffuse.

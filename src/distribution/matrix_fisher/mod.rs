@@ -221,6 +221,16 @@ impl MatrixFisher {
         Ok(Self::from_svd(ProperSvd { s, ..svd })?)
     }
 
+    /// The same, sought from a neighbour such as the belief a step before.
+    pub fn from_mean_near(
+        mean: &Matrix3<f64>,
+        neighbour: &Self,
+    ) -> Result<Self, MatrixFisherError> {
+        let svd = proper_svd(mean)?;
+        let s = s_from_complement_near(&svd.s.map(|d| 1.0 - d), &neighbour.moments)?;
+        Ok(Self::from_svd(ProperSvd { s, ..svd })?)
+    }
+
     /// The distribution with the given mode and, at the mode, the given Hessian of minus the
     /// log-density with respect to the body-frame rotation vector `e` of `mode exp(e^)`, 1/rad^2.
     ///

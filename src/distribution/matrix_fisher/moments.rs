@@ -1,6 +1,7 @@
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3, Vector4};
 
 use super::engine::{self, Sums};
+use super::first::FirstMoments;
 use super::forms::{self, Basis, CUBICS, FORMS};
 use super::{InvalidSingularValues, check_singular_values};
 
@@ -72,6 +73,12 @@ impl Moments {
             cubics: pass.cubics,
             basis: pass.basis,
         }
+    }
+
+    /// What the inversion starts from.
+    pub(super) fn up_to_second(&self) -> FirstMoments {
+        let sums = Sums::of_singular_values(&self.s);
+        FirstMoments { sums, squares: self.squares, products: self.products }
     }
 
     /// The proper singular values `S`.

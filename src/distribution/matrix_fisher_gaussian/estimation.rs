@@ -146,17 +146,32 @@ where
         samples: &[WeightedSample<D>],
         correlation: Correlation,
     ) -> Result<Self, MfgError> {
-        let total: f64 = samples.iter().map(|s| s.weight).sum();
-        let first = samples.first().filter(|_| total > 0.0).ok_or(MfgError::NoSamples)?;
-        let mean =
-            |r: Matrix3<f64>, s: &WeightedSample<D>| r + s.attitude.matrix() * (s.weight / total);
-        let attitude = MatrixFisher::from_mean(&samples.iter().fold(Matrix3::zeros(), mean))?;
-        let deviation = |s: &WeightedSample<D>| {
-            correlation.deviation(&attitude.centred(&s.attitude), &attitude.svd().s)
-        };
+        let mean = mean_rotation(samples.iter().map(|s| (s.weight, s.attitude)))?;
+        Self::from_samples_about(MatrixFisher::from_mean(&mean)?, samples, correlation)
+    }
 
+    /// The same where the samples are sigma points of a belief that have moved a step on: its
+    /// concentrations are sought from those of `before`.
+    pub fn from_sigma_points(
+        points: &[WeightedSample<D>],
+        before: &Self,
+    ) -> Result<Self, MfgError> {
+        let mean = mean_rotation(points.iter().map(|s| (s.weight, s.attitude)))?;
+        let attitude = MatrixFisher::from_mean_near(&mean, before.attitude())?;
+        Self::from_samples_about(attitude, points, before.correlation())
+    }
+
+    /// Theorem 3.6 for samples whose mean `E[R]` is that of `attitude`.
+    fn from_samples_about(
+        attitude: MatrixFisher,
+        samples: &[WeightedSample<D>],
+        correlation: Correlation,
+    ) -> Result<Self, MfgError> {
+        let first = samples.first().ok_or(MfgError::NoSamples)?;
+        let total: f64 = samples.iter().map(|s| s.weight).sum();
         let mut moments = ConditionalMoments {
             mean: &first.x * 0.0,
+            // Linear in the mean of Q, which is diagonal.
             deviation_mean: Vector3::zeros(),
             covariance: &first.x * first.x.transpose() * 0.0,
             cross: &first.x * Vector3::zeros().transpose(),
@@ -165,12 +180,11 @@ where
         for sample in samples {
             let weight = sample.weight / total;
             moments.mean += &sample.x * weight;
-            moments.deviation_mean += deviation(sample) * weight;
         }
         for sample in samples {
             let weight = sample.weight / total;
             let x = &sample.x - &moments.mean;
-            let v = deviation(sample) - moments.deviation_mean;
+            let v = correlation.deviation(&attitude.centred(&sample.attitude), &attitude.svd().s);
             moments.covariance += &x * x.transpose() * weight;
             moments.cross += &x * v.transpose() * weight;
             moments.deviation_covariance += v * v.transpose() * weight;
@@ -221,6 +235,18 @@ where
     pub fn tangent_information(&self) -> Vector3<f64> {
         tangent_information(self.attitude())
     }
+}
+
+/// `E[R]` of weighted attitudes.
+fn mean_rotation(
+    samples: impl Iterator<Item = (f64, Rotation3<f64>)>,
+) -> Result<Matrix3<f64>, MfgError> {
+    let (mut total, mut sum) = (0.0, Matrix3::zeros());
+    for (weight, attitude) in samples {
+        total += weight;
+        sum += attitude.matrix() * weight;
+    }
+    if total > 0.0 { Ok(sum / total) } else { Err(MfgError::NoSamples) }
 }
 
 fn diagonal(v: &Vector3<f64>) -> Matrix3<f64> {

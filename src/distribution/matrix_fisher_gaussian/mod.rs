@@ -57,7 +57,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::matrix_fisher::{
     MatrixFisher, MatrixFisherError, MatrixFisherSampler, sums_of_singular_values,
 };
-use crate::so3::{ProperSvd, exp, vee};
+use crate::so3::{ProperSvd, exp};
 
 pub use estimation::{ConditionalMoments, TangentGaussian, WeightedSample};
 
@@ -86,11 +86,12 @@ pub enum Correlation {
 impl Correlation {
     /// `v_R` of `Q = U^T R V` (3.3).
     pub fn deviation(self, q: &Rotation3<f64>, s: &Vector3<f64>) -> Vector3<f64> {
-        let (q, s) = (q.matrix(), Matrix3::from_diagonal(s));
-        match self {
-            Self::World => vee(&(q * s - s * q.transpose())),
-            Self::Body => vee(&(s * q - q.transpose() * s)),
-        }
+        let q = q.matrix();
+        Vector3::from_fn(|i, _| {
+            let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+            let (kj, jk) = self.weights(s, j, k);
+            kj * q[(k, j)] - jk * q[(j, k)]
+        })
     }
 
     /// The 3x9 matrix `L` with `v_R = L vec R` for this distribution of the attitude.
@@ -101,18 +102,22 @@ impl Correlation {
     }
 
     /// The 3x9 matrix `L` with `v_R = L vec Q`, columns stacked.
-    fn central_regression(self, s: &Vector3<f64>) -> SMatrix<f64, 3, 9> {
+    pub fn central_regression(self, s: &Vector3<f64>) -> SMatrix<f64, 3, 9> {
         let mut l = SMatrix::zeros();
         for (i, j, k) in [(0, 1, 2), (1, 2, 0), (2, 0, 1)] {
-            // Component i is weight_kj Q_kj - weight_jk Q_jk.
-            let (kj, jk) = match self {
-                Self::World => (s[j], s[k]),
-                Self::Body => (s[k], s[j]),
-            };
+            let (kj, jk) = self.weights(s, j, k);
             l[(i, k + 3 * j)] = kj;
             l[(i, j + 3 * k)] = -jk;
         }
         l
+    }
+
+    /// Component `i` of `v_R` is the first times `Q_kj` less the second times `Q_jk`.
+    fn weights(self, s: &Vector3<f64>, j: usize, k: usize) -> (f64, f64) {
+        match self {
+            Self::World => (s[j], s[k]),
+            Self::Body => (s[k], s[j]),
+        }
     }
 }
 

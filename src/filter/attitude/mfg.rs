@@ -138,7 +138,7 @@ impl AttitudeMfg {
                 }
             }
         }
-        let belief = Belief::from_sigma_points(&propagated, self.belief.correlation())?;
+        let belief = Belief::from_sigma_points(&propagated, &self.belief)?;
         Ok(belief.add_independent(&Vector3::zeros(), &(self.gyro.bias_walk * h))?)
     }
 }

@@ -8,11 +8,10 @@
 //! the moments of `Q` up to order three with 9-vectors. In the first order in `d` the left
 //! Jacobian makes this exact for any angle `h |w|`.
 
-use std::sync::LazyLock;
-
 use nalgebra::{Const, Matrix3, Rotation3, SMatrix, U3, Vector3};
 
 use super::super::bayes::{FilterError, InertialStep};
+use super::super::third_moments::{ThirdMoments, Vector9};
 use super::GyroModel;
 use super::mean::PolarMean;
 use crate::distribution::matrix_fisher::{
@@ -27,21 +26,10 @@ pub type Belief = MatrixFisherGaussian<Const<3>>;
 
 /// Three linear functionals of `vec(Q)`, a column each.
 type Forms = SMatrix<f64, 9, 3>;
-/// A bilinear functional of `vec(Q)`.
-type Bilinear = SMatrix<f64, 9, 9>;
 
-/// `v_R` as functionals of `vec(Q)`, columns stacked.
+/// `v_R` as functionals of `vec(Q)`.
 pub(super) fn deviation_forms(correlation: Correlation, s: &Vector3<f64>) -> Forms {
-    let mut forms = Forms::zeros();
-    for (i, j, k) in [(0, 1, 2), (1, 2, 0), (2, 0, 1)] {
-        let (kj, jk) = match correlation {
-            Correlation::World => (s[j], s[k]),
-            Correlation::Body => (s[k], s[j]),
-        };
-        forms[(k + 3 * j, i)] = kj;
-        forms[(j + 3 * k, i)] = -jk;
-    }
-    forms
+    correlation.central_regression(s).transpose()
 }
 
 /// The functionals `<U C_i V^T, Q>` of the matrices `C_i` that `forms` holds.
@@ -58,40 +46,19 @@ fn map_forms(forms: &Forms, f: impl Fn(Matrix3<f64>) -> Matrix3<f64>) -> Forms {
     mapped
 }
 
+/// The matrix of which `v` is the vector.
+fn matrix(v: &Vector9) -> Matrix3<f64> {
+    Matrix3::from_column_slice(v.as_slice())
+}
+
 /// `vec(E[Q])`.
-pub(super) fn first_vector(moments: &Moments) -> SMatrix<f64, 9, 1> {
-    let mut r = SMatrix::zeros();
+pub(super) fn first_vector(moments: &Moments) -> Vector9 {
+    let mut r = Vector9::zeros();
     for (i, d) in moments.first().iter().enumerate() {
         r[4 * i] = *d;
     }
     r
 }
-
-/// Positions in `vec(Q)` of the products of three entries that do not vanish.
-static TRIPLES: LazyLock<Vec<[usize; 3]>> = LazyLock::new(|| {
-    let entry = |e: usize| (e % 3, e / 3);
-    // Signs: turns by pi about the axes flip entries; a moment that changes sign vanishes.
-    let survives = |t: &[usize; 3]| {
-        (0..3).all(|axis| {
-            let flips = |e: &usize| (entry(*e).0 == axis) != (entry(*e).1 == axis);
-            t.iter().filter(|e| flips(e)).count() % 2 == 0
-        })
-    };
-    let all = (0..729).map(|n| [n % 9, n / 9 % 9, n / 81]);
-    all.filter(survives).collect()
-});
-
-/// `E[<f, Q> r r^T]`.
-fn third_contracted(moments: &Moments, f: &Vector9) -> Bilinear {
-    let entry = |e: usize| (e % 3, e / 3);
-    let mut contracted = Bilinear::zeros();
-    for &[a, b, c] in TRIPLES.iter() {
-        contracted[(b, c)] += f[a] * moments.third(entry(a), entry(b), entry(c));
-    }
-    contracted
-}
-
-type Vector9 = SMatrix<f64, 9, 1>;
 
 /// The belief one interval later.
 pub(super) fn propagate(
@@ -111,18 +78,24 @@ pub(super) fn propagate(
     let scatter = to_axes * (gyro.noise * h + sigma_c * (h * h)) * to_axes.transpose();
     let loss = 0.5 * (Matrix3::from_diagonal_element(scatter.trace()) - scatter);
 
-    let deviation = deviation_forms(belief.correlation(), &s);
+    // d = by_r^T r + noise, and what its mean makes of the moments: E[d_l r r^T].
+    let by_r = deviation_forms(belief.correlation(), &s) * slope.transpose();
     let second = moments.second_matrix();
-    let with_deviation = second * deviation;
+    let third = ThirdMoments::of(moments);
+    let with_rate = [0, 1, 2].map(|l| third.weighted(&by_r.column(l).into_owned()));
     let complement = Matrix3::from_diagonal(&moments.complement());
     let mut x = complement + loss - complement * loss;
     for l in 0..3 {
-        let q_times_deviation = Matrix3::from_column_slice(with_deviation.column(l).as_slice());
-        x -= q_times_deviation * hat(&slope.column(l).into_owned());
+        let axis = hat(&Vector3::ith(l, 1.0));
+        x -= matrix(&(second * by_r.column(l))) * axis;
+        for m in 0..3 {
+            x -= matrix(&(with_rate[l] * by_r.column(m))) * axis * hat(&Vector3::ith(m, 0.5));
+        }
     }
     let mean = PolarMean::from_deviation(&Rotation3::identity(), &x)?.principal();
     let (turn_u, turn_v) = (mean.axes_in_world, mean.axes_in_body());
-    let s_next = s_from_complement_near(&mean.complement, &s).map_err(MatrixFisherError::from)?;
+    let s_next =
+        s_from_complement_near(&mean.complement, moments).map_err(MatrixFisherError::from)?;
     let svd = ProperSvd { u: u * turn_u, s: s_next, v: exp(&-angle) * v * turn_v };
     let attitude = MatrixFisher::from_svd(svd).map_err(MatrixFisherError::from)?;
 
@@ -137,12 +110,9 @@ pub(super) fn propagate(
         let generator = hat(&Vector3::ith(axis, 1.0));
         map_forms(&next, |c| c * generator.transpose())
     });
-    let by_slope: [Bilinear; 3] = std::array::from_fn(|axis| {
-        third_contracted(moments, &(deviation * slope.row(axis).transpose()))
-    });
-    let mut turned = SMatrix::<f64, 9, 3>::zeros();
-    for (bilinear, rate) in by_slope.iter().zip(&rates) {
-        turned += bilinear * rate;
+    let mut turned = Forms::zeros();
+    for (weighted, rate) in with_rate.iter().zip(&rates) {
+        turned += weighted * rate;
     }
     let mixed = kept.transpose() * turned;
     let mut deviation_covariance = kept.transpose() * second * kept + mixed + mixed.transpose();
@@ -156,6 +126,7 @@ pub(super) fn propagate(
     }
     // Noise of the bias given the attitude and the rotation that it causes.
     let bias_with_turn = sigma_c * to_axes.transpose() * -h;
+    let deviation = deviation_forms(belief.correlation(), &s);
     let cross = p * (deviation.transpose() * (second * kept + turned)) + bias_with_turn * drift;
     let deviation_variance = Matrix3::from_diagonal(&belief.deviation_moments());
     let conditional = ConditionalMoments::<U3> {

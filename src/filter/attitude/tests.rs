@@ -391,6 +391,34 @@ fn moment_propagation_is_that_of_samples() {
     }
 }
 
+/// A turn that depends on the attitude through the bias disperses it in the second order of the
+/// step: the mean attitude against quadrature on SO(3), without noise.
+#[test]
+fn the_mean_of_a_long_step_is_of_second_order() {
+    let grid = HaarQuadrature::of_degree(40);
+    let gyro = GyroModel::isotropic(0.0, 0.0);
+    let step = InertialStep::turning(Vector3::new(1.0, -2.0, 0.5), 0.1);
+    for correlation in [Correlation::World, Correlation::Body] {
+        let belief = correlated_belief(correlation, [6.0, 4.0, 1.0], 0.5);
+        let spread = belief.conditional_factor() * 3f64.sqrt() * step.seconds;
+        let mut mean = Matrix3::zeros();
+        let mut total = 0.0;
+        for (r, weight) in grid.nodes() {
+            let weight = weight * belief.attitude().log_density(r).exp();
+            let angle = (step.angular_velocity - belief.conditional_mean(r)) * step.seconds;
+            for offset in spread.column_iter().flat_map(|c| [c.into_owned(), -c]) {
+                mean += (r * exp(&(angle + offset))).matrix() * (weight / 6.0);
+            }
+            total += weight;
+        }
+        assert!((total - 1.0).abs() < 1e-9);
+        let found = propagate(&belief, &gyro, &step).unwrap().attitude().mean();
+        let kept = belief.attitude().mean() * exp(&(step.angular_velocity * 0.1)).matrix();
+        let (error, change) = ((found - mean).amax(), (kept - mean).amax());
+        assert!(error < 3e-4 && change > 3e-3, "{error} {change}");
+    }
+}
+
 /// The step must matter in the test above: without it the slope differs by far more.
 #[test]
 fn a_step_builds_correlation_between_attitude_and_bias() {
@@ -462,6 +490,49 @@ fn moments_and_sigma_points_propagate_alike_when_concentrated() {
     let slope = |b: &Belief| b.p() * b.regression();
     let change = (slope(&moments) - slope(filter.belief())).amax() / slope(&moments).amax();
     assert!(change < 1e-2, "{change}");
+}
+
+/// Sigma points further than a right angle from the mode let the correlation of bias and attitude
+/// feed on itself: a belief so broad is propagated by its moments.
+#[test]
+fn sigma_points_beyond_a_right_angle_are_not_used() {
+    let gyro = GyroModel::isotropic(0.02, 1e-4);
+    let step = InertialStep::turning(Vector3::new(0.3, -0.2, 0.5), 0.02);
+    let propagated = |s: [f64; 3], propagation: MfgPropagation| {
+        let belief = correlated_belief(Correlation::World, s, 0.1);
+        let mut filter = AttitudeMfg::from_belief(propagation, &gyro, belief).unwrap();
+        filter.propagate(&step).unwrap();
+        filter.estimate()
+    };
+    let [points, moments] = [MfgPropagation::SigmaPoints, MfgPropagation::Moments];
+    assert_eq!(propagated([2.0, 1.0, -0.5], points), propagated([2.0, 1.0, -0.5], moments));
+    assert_ne!(propagated([20.0, 15.0, 10.0], points), propagated([20.0, 15.0, 10.0], moments));
+}
+
+/// The case in which that correlation grew: one direction for minutes, the turn about it unknown.
+#[test]
+fn the_bias_stays_bounded_where_the_turn_about_a_direction_is_unknown() {
+    let (rate, bias) = (Vector3::new(0.6, -0.4, 1.0), Vector3::new(0.05, -0.05, 0.05));
+    for kind in [AttitudeFilterKind::Mfgiu, AttitudeFilterKind::Mfgbu] {
+        let prior = AttitudePrior {
+            gyro_bias_covariance: Matrix3::from_diagonal_element(0.01),
+            ..AttitudePrior::matrix_fisher(&Matrix3::identity()).unwrap()
+        };
+        let mut filter = kind.start(&GyroModel::isotropic(0.1, 1e-3), &prior).unwrap();
+        let mut truth = Rotation3::identity();
+        for k in 1..=4000 {
+            filter.propagate(&InertialStep::turning(rate + bias, 0.05)).unwrap();
+            truth *= exp(&(rate * 0.05));
+            if k % 4 == 0 {
+                let seen = truth.inverse() * Vector3::y();
+                let measured = VectorMeasurement::of_world_direction(Vector3::y(), seen, 100.0);
+                filter.update_directions(&[measured]).unwrap();
+            }
+        }
+        let found = filter.estimate().gyro_bias.unwrap();
+        assert!((found.mean - bias).norm() < 0.3, "{kind} {}", found.mean);
+        assert!(found.covariance.trace() < 0.04, "{kind} {}", found.covariance);
+    }
 }
 
 #[test]

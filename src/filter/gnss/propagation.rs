@@ -65,7 +65,7 @@ impl MomentPropagator {
         let mean = Matrix3::from_column_slice(moved.mean_q.as_slice());
         let svd = proper_svd(&mean).map_err(MatrixFisherError::from)?;
         let before = belief.attitude.svd();
-        let s = s_from_complement_near(&svd.s.map(|d| 1.0 - d), &before.s)
+        let s = s_from_complement_near(&svd.s.map(|d| 1.0 - d), belief.attitude.moments())
             .map_err(MatrixFisherError::from)?;
         let attitude = MatrixFisher::from_svd(ProperSvd {
             u: before.u * svd.u,
