@@ -98,6 +98,8 @@ struct Report {
     gaps: usize,
     fixes_used: usize,
     fixes_rejected: usize,
+    /// Fixes that enlarged the belief.
+    surprises: usize,
     /// s after the first fix; null where the heading has not converged.
     heading_converged_s: Option<f64>,
     nis: Option<Consistency>,
@@ -260,6 +262,7 @@ fn report(
         gaps: summary.gaps,
         fixes_used: summary.used,
         fixes_rejected: summary.rejected,
+        surprises: summary.surprises,
         heading_converged_s: summary.heading_converged,
         nis: Consistency::of(&since(0.0)),
         nis_after_convergence: summary
@@ -275,8 +278,8 @@ fn print(report: &Report, config: &GnssConfig) {
     println!("first fix             {:.3} s", report.start);
     println!("IMU samples, gaps     {}, {}", report.imu_samples, report.gaps);
     println!(
-        "fixes                 {} used, {} rejected",
-        report.fixes_used, report.fixes_rejected
+        "fixes                 {} used, {} rejected, {} a surprise",
+        report.fixes_used, report.fixes_rejected, report.surprises
     );
     let limit = config.start.converged_heading_sd;
     match report.heading_converged_s {

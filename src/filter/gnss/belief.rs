@@ -3,10 +3,11 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
 use super::central::{Matrix9, mean_and_covariance};
-use crate::distribution::matrix_fisher::MatrixFisher;
+use crate::distribution::matrix_fisher::{MatrixFisher, MatrixFisherError};
 use crate::distribution::matrix_fisher_gaussian::Correlation;
 use crate::filter::FilterError;
 use crate::inertial::{Belief, NavCovariance, NavState, block, symmetrize};
+use crate::so3::ProperSvd;
 
 /// Dimension of the Euclidean part: velocity, position, gyroscope bias, accelerometer bias, in
 /// the order of [`NavCovariance`].
@@ -83,10 +84,19 @@ impl NavigationBelief {
                 regress(moments, axes, &quaternion_products())?
             }
             Regression::Full(correlation) | Regression::Projected(correlation) => {
-                regress(moments, axes, &deviation(correlation, &s))?
+                regress(moments, axes, &correlation.central_regression(&s))?
             }
         };
         Ok(Self { attitude, mean, slope, conditional })
+    }
+
+    /// The belief with all covariances multiplied by `factor`, to leading order in the dispersion of
+    /// the attitude.
+    pub fn enlarged(&self, factor: f64) -> Result<Self, FilterError> {
+        let svd = self.attitude.svd();
+        let svd = ProperSvd { s: svd.s / factor, ..*svd };
+        let attitude = MatrixFisher::from_svd(svd).map_err(MatrixFisherError::from)?;
+        Ok(Self { attitude, conditional: self.conditional * factor, ..self.clone() })
     }
 
     pub fn is_finite(&self) -> bool {
@@ -98,7 +108,7 @@ impl NavigationBelief {
     /// the rotation vector to first order.
     pub fn summary(&self) -> Belief {
         let moments = self.joint_moments();
-        let antisymmetric = deviation(Correlation::Body, &Vector3::repeat(0.5));
+        let antisymmetric = Correlation::Body.central_regression(&Vector3::repeat(0.5));
         let cross = moments.cross * antisymmetric.transpose();
         let variances = (antisymmetric * moments.q * antisymmetric.transpose()).diagonal();
         let rotation = self.attitude.rotation_covariance();
@@ -130,20 +140,6 @@ impl NavigationBelief {
             accel_bias: part(ACCEL_BIAS),
         }
     }
-}
-
-/// The 3x9 matrix `L` with `v_R = L q` (W22 3.3).
-fn deviation(correlation: Correlation, s: &Vector3<f64>) -> SMatrix<f64, 3, 9> {
-    let mut l = SMatrix::zeros();
-    for (i, j, k) in [(0, 1, 2), (1, 2, 0), (2, 0, 1)] {
-        let (kj, jk) = match correlation {
-            Correlation::World => (s[j], s[k]),
-            Correlation::Body => (s[k], s[j]),
-        };
-        l[(i, k + 3 * j)] = kj;
-        l[(i, j + 3 * k)] = -jk;
-    }
-    l
 }
 
 /// The 9x9 matrix that turns `q` into products of components of the unit quaternion, up to a

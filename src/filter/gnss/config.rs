@@ -31,8 +31,10 @@ pub struct ReceiverConfig {
     /// A fix is rejected if its normalized innovation squared exceeds the chi-square bound of this
     /// probability (3 degrees of freedom); 1 accepts every fix.
     pub gate_probability: f64,
-    /// After so many rejections in a row the position is taken to have jumped: it is given up, and
-    /// found again from the next fix, the rest of the state being kept.
+    /// After so many rejections in a row the next fix is used. The position is taken to have jumped:
+    /// it is given up, the rest of the state being kept, unless
+    /// [`surprise_probability`](GnssFilterConfig::surprise_probability) says that all of it is to
+    /// be less certain.
     pub max_rejected: usize,
 }
 
@@ -60,12 +62,15 @@ impl ReceiverConfig {
 
     /// Largest acceptable normalized innovation squared.
     pub(super) fn gate(&self) -> f64 {
-        match ChiSquared::new(3.0) {
-            Ok(distribution) if self.gate_probability < 1.0 => {
-                distribution.inverse_cdf(self.gate_probability.max(0.0))
-            }
-            _ => f64::INFINITY,
-        }
+        bound(self.gate_probability)
+    }
+}
+
+/// What a normalized innovation squared exceeds with the probability that is left.
+fn bound(probability: f64) -> f64 {
+    match ChiSquared::new(3.0) {
+        Ok(distribution) if probability < 1.0 => distribution.inverse_cdf(probability.max(0.0)),
+        _ => f64::INFINITY,
     }
 }
 
@@ -103,12 +108,28 @@ impl Default for StartConfig {
     }
 }
 
-/// How the matrix Fisher-Gaussian filters update the attitude.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+/// How the filters update.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct GnssFilterConfig {
-    /// `flow` or `sigma-points` (W22 table 5.2).
+    /// `flow` or `sigma-points` (W22 table 5.2); for the matrix Fisher-Gaussian filters.
     pub attitude_update: AttitudeUpdate,
+    /// A fix beyond the chi-square bound of this probability shows that the belief was too sure of
+    /// itself: its covariance is multiplied until the fix lies on the bound. 1 leaves it alone.
+    pub surprise_probability: f64,
+}
+
+impl Default for GnssFilterConfig {
+    fn default() -> Self {
+        Self { attitude_update: AttitudeUpdate::default(), surprise_probability: 1.0 }
+    }
+}
+
+impl GnssFilterConfig {
+    /// Largest normalized innovation squared that the belief is taken to allow for.
+    pub(super) fn surprise(&self) -> f64 {
+        bound(self.surprise_probability)
+    }
 }
 
 /// Artificial outages: fixes in them are withheld and compared with the prediction.
@@ -169,6 +190,7 @@ impl GnssConfig {
             ("imu.gyro_bias_walk", self.imu.gyro_bias_walk),
             ("imu.accel_bias_walk", self.imu.accel_bias_walk),
             ("receiver.gate_probability", self.receiver.gate_probability),
+            ("filter.surprise_probability", self.filter.surprise_probability),
             ("start.window", self.start.window),
             ("start.converged_heading_sd", self.start.converged_heading_sd),
             ("outage.start", self.outage.start),

@@ -168,6 +168,11 @@ impl GnssFilter for MekfGnss {
         }
     }
 
+    fn enlarge(&mut self, factor: f64) -> Result<(), FilterError> {
+        self.belief.covariance *= factor;
+        Ok(())
+    }
+
     fn belief(&self) -> Belief {
         self.belief
     }

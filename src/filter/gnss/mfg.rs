@@ -99,6 +99,11 @@ impl GnssFilter for MfgGnss {
         }
     }
 
+    fn enlarge(&mut self, factor: f64) -> Result<(), FilterError> {
+        self.belief = self.belief.enlarged(factor)?;
+        Ok(())
+    }
+
     fn belief(&self) -> Belief {
         self.belief.summary()
     }

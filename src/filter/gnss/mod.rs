@@ -104,7 +104,27 @@ impl Innovation {
             Err(FilterError::NotFinite("innovation"))
         }
     }
+
+    /// By what the covariance of the belief must be multiplied for the normalized innovation
+    /// squared to come down to `bound`, the measurement's own noise being as it is.
+    fn enlargement(&self, noise: &Matrix3<f64>, bound: f64) -> Result<f64, FilterError> {
+        let predicted = self.covariance - noise;
+        let (mut factor, mut nis) = (1.0, self.nis);
+        // The covariance grows by less than the belief's, so that this comes from below.
+        for _ in 0..MAX_ENLARGEMENTS {
+            if nis <= bound * (1.0 + ENLARGEMENT_TOLERANCE) {
+                return Ok(factor);
+            }
+            factor *= nis / bound;
+            nis = Self::new(self.residual, predicted * factor + noise)?.nis;
+        }
+        Err(FilterError::NoConvergence("the enlargement of the belief"))
+    }
 }
+
+const MAX_ENLARGEMENTS: usize = 1000;
+/// Of the bound.
+const ENLARGEMENT_TOLERANCE: f64 = 0.01;
 
 /// A recursive estimator of attitude, velocity, position and biases.
 pub trait GnssFilter: BayesFilter {
@@ -113,6 +133,9 @@ pub trait GnssFilter: BayesFilter {
 
     /// Adds an independent error of this variance (m^2) to each component of the position.
     fn loosen_position(&mut self, variance: f64);
+
+    /// Multiplies the covariance of the belief, about the same estimate.
+    fn enlarge(&mut self, factor: f64) -> Result<(), FilterError>;
 
     /// The estimate, and the joint covariance of its error.
     fn belief(&self) -> Belief;

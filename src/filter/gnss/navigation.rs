@@ -91,6 +91,8 @@ pub struct NavigationSummary {
     pub gaps: usize,
     pub used: usize,
     pub rejected: usize,
+    /// Fixes that enlarged the belief (`filter.surprise_probability`).
+    pub surprises: usize,
     /// Normalized innovations squared of fixes that were used, and the time of each after the
     /// first fix, s.
     pub nis: Vec<(f64, f64)>,
@@ -213,6 +215,7 @@ struct Run<'a> {
     config: &'a GnssConfig,
     filter: Box<dyn GnssFilter>,
     gate: f64,
+    surprise: f64,
     rejected_in_a_row: usize,
     last_output: Stamp,
     outages: OutageErrors,
@@ -238,6 +241,7 @@ impl<'a> Run<'a> {
             config,
             filter,
             gate: config.receiver.gate(),
+            surprise: config.filter.surprise(),
             rejected_in_a_row: 0,
             last_output: fix.stamp,
             outages: OutageErrors::default(),
@@ -286,7 +290,11 @@ impl<'a> Run<'a> {
             self.summary.rejected += 1;
             FixUse::Rejected
         } else {
-            if innovation.nis > self.gate {
+            if innovation.nis > self.surprise {
+                let factor = innovation.enlargement(&position.covariance, self.surprise);
+                factor.and_then(|factor| self.filter.enlarge(factor)).map_err(at)?;
+                self.summary.surprises += 1;
+            } else if innovation.nis > self.gate {
                 // The position has jumped, not the rest of the state.
                 self.filter.loosen_position(innovation.residual.norm_squared());
             }
