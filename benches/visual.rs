@@ -93,7 +93,10 @@ fn map(c: &mut Criterion) {
     let filter = FilterKind::Mfgr.start(&FilterConfig::default(), propagator, belief());
     let pairs = pairs(500);
     c.bench_function("refine/500", |b| {
-        b.iter(|| pairs.iter().filter_map(|pair| filter.refine(black_box(pair))).count());
+        b.iter(|| {
+            let refinement = filter.map_refinement();
+            pairs.iter().filter_map(|pair| refinement.posterior(black_box(pair))).count()
+        });
     });
 }
 

@@ -1,5 +1,6 @@
 use nalgebra::{Matrix3, Matrix6, Rotation3, SMatrix, SVector, Vector3, Vector6};
 
+use super::symmetric::{PointQuadratic, Symmetric3};
 use crate::distribution::regression::{JointInformation, RotationRegression};
 use crate::distribution::rotation_quadratic::{
     RotationQuadratic, rotated_vector_by_rotation, vectorize,
@@ -25,24 +26,43 @@ impl PointPair {
         (a - Matrix3::identity() * a[(0, 0)]).amax() <= 1e-12 * a[(0, 0)]
     }
 
+    /// `R A R^T + B`.
+    pub(crate) fn covariance(&self, world_from_body: &Matrix3<f64>) -> Symmetric3 {
+        Symmetric3::turned(&self.body_covariance, world_from_body)
+            + Symmetric3::of(&self.world_covariance)
+    }
+
     /// `(R A R^T + B)^-1`; `None` if that covariance is not positive definite.
-    pub(crate) fn weight(&self, world_from_body: &Matrix3<f64>) -> Option<Matrix3<f64>> {
-        let rotated = world_from_body * self.body_covariance * world_from_body.transpose();
-        inverse_of_positive(&(rotated + self.world_covariance))
+    pub(crate) fn weight(&self, world_from_body: &Matrix3<f64>) -> Option<Symmetric3> {
+        self.covariance(world_from_body).inverse_of_positive()
     }
 }
 
-/// Inverse of a symmetric matrix by its cofactors; `None` unless it is positive definite.
-fn inverse_of_positive(m: &Matrix3<f64>) -> Option<Matrix3<f64>> {
-    let (a, b, c) = (m[(0, 0)], m[(0, 1)], m[(0, 2)]);
-    let (d, e, f) = (m[(1, 1)], m[(1, 2)], m[(2, 2)]);
-    let (aa, ab, ac) = (d * f - e * e, c * e - b * f, b * e - c * d);
-    let (bb, bc, cc) = (a * f - c * c, b * c - a * e, a * d - b * b);
-    let determinant = a * aa + b * ab + c * ac;
-    // An infinite or undefined entry makes one of these false.
-    let positive = a > 0.0 && cc > 0.0 && determinant > 0.0 && determinant.is_finite();
-    let inverse = Matrix3::new(aa, ab, ac, ab, bb, bc, ac, bc, cc) * determinant.recip();
-    (positive && inverse.iter().all(|x| x.is_finite())).then_some(inverse)
+/// A pair as it looks from a pose.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct WeightedResidual {
+    in_body: Vector3<f64>,
+    /// The map point relative to the position of the body, m.
+    target: Vector3<f64>,
+    /// Inverse of the residual's covariance, the pose being exact.
+    pub weight: Symmetric3,
+    /// Squared Mahalanobis distance.
+    distance: f64,
+}
+
+impl WeightedResidual {
+    /// `None` without a positive definite covariance or finite coordinates.
+    pub fn at(
+        pair: &PointPair,
+        world_from_body: &Rotation3<f64>,
+        position: &Vector3<f64>,
+    ) -> Option<Self> {
+        let weight = pair.weight(world_from_body.matrix())?;
+        let target = pair.in_world - position;
+        let distance = weight.quadratic(&(world_from_body * pair.in_body - target));
+        let residual = Self { in_body: pair.in_body, target, weight, distance };
+        distance.is_finite().then_some(residual)
+    }
 }
 
 /// Down-weighting of residuals that the Gaussian model does not explain.
@@ -89,22 +109,27 @@ impl PoseInformation {
     /// Accumulates `pairs` with the weights taken at the pose (`world_from_body`, `position`).
     ///
     /// Pairs without a positive definite covariance or finite coordinates are left out. `O(N)`, no allocation.
-    pub fn accumulate(
-        pairs: &[PointPair],
+    pub fn accumulate<'a>(
+        pairs: impl IntoIterator<Item = &'a PointPair>,
         world_from_body: &Rotation3<f64>,
         position: &Vector3<f64>,
         kernel: RobustKernel,
     ) -> Self {
+        let residuals = pairs
+            .into_iter()
+            .filter_map(|pair| WeightedResidual::at(pair, world_from_body, position));
+        Self::sum(residuals, position, kernel)
+    }
+
+    /// The same of residuals at one pose with the given position.
+    pub(crate) fn sum(
+        residuals: impl IntoIterator<Item = WeightedResidual>,
+        position: &Vector3<f64>,
+        kernel: RobustKernel,
+    ) -> Self {
         let mut sums = PointSums::default();
-        for pair in pairs {
-            if let Some(weight) = pair.weight(world_from_body.matrix()) {
-                let target = pair.in_world - position;
-                let residual = world_from_body * pair.in_body - target;
-                let distance = residual.dot(&(weight * residual));
-                if distance.is_finite() {
-                    sums.add(&pair.in_body, &target, &(weight * kernel.weight(distance)));
-                }
-            }
+        for residual in residuals {
+            sums.add(&residual, kernel.weight(residual.distance));
         }
         sums.form(*position)
     }
@@ -157,17 +182,13 @@ impl PoseInformation {
     }
 }
 
-/// The products `u_a u_b`, `a <= b`, of `u = (p', 1)`, in the order of [`PointSums::weights`].
-const PRODUCTS: [(usize, usize); 10] =
-    [(0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3)];
-
 /// What a quadratic form in `(r, t)` needs of its points: each weight matrix has six different
 /// entries and each `J_i` consists of the numbers `u = (p', 1)`, which makes 60 sums instead of the
 /// 144 of the information matrix.
 #[derive(Default)]
 struct PointSums {
-    /// Sums of `u_a u_b W`, the six entries of `W` row by row.
-    weights: [[f64; 6]; PRODUCTS.len()],
+    /// Sums of `u_a u_b W`.
+    weights: PointQuadratic,
     /// Sums of `u_a W p`.
     targets: [Vector3<f64>; 4],
     /// Sum of `p^T W p`.
@@ -176,17 +197,12 @@ struct PointSums {
 }
 
 impl PointSums {
-    fn add(&mut self, in_body: &Vector3<f64>, target: &Vector3<f64>, weight: &Matrix3<f64>) {
-        let u = [in_body.x, in_body.y, in_body.z, 1.0];
-        let w = [weight.m11, weight.m12, weight.m13, weight.m22, weight.m23, weight.m33];
-        for (sums, (a, b)) in self.weights.iter_mut().zip(PRODUCTS) {
-            let product = u[a] * u[b];
-            for (sum, entry) in sums.iter_mut().zip(w) {
-                *sum += product * entry;
-            }
-        }
+    fn add(&mut self, residual: &WeightedResidual, factor: f64) {
+        let WeightedResidual { in_body, target, .. } = residual;
+        let weight = residual.weight * factor;
+        self.weights.add(in_body, &weight);
         let weighted = weight * target;
-        for (sum, u) in self.targets.iter_mut().zip(u) {
+        for (sum, u) in self.targets.iter_mut().zip([in_body.x, in_body.y, in_body.z, 1.0]) {
             *sum += weighted * u;
         }
         self.constant += target.dot(&weighted);
@@ -201,8 +217,8 @@ impl PointSums {
             eta_r: SVector::zeros(),
             eta_x: self.targets[3],
         };
-        for (w, (a, b)) in self.weights.iter().zip(PRODUCTS) {
-            let block = Matrix3::new(w[0], w[1], w[2], w[1], w[3], w[4], w[2], w[4], w[5]);
+        for ((a, b), sum) in self.weights.coefficients() {
+            let block = sum.matrix();
             match (a, b) {
                 (3, _) => joint.xx = block,
                 (_, 3) => joint.rx.fixed_view_mut::<3, 3>(3 * a, 0).copy_from(&block),
@@ -295,28 +311,6 @@ mod tests {
                 prop_assert!((slope - vector[k]).abs() < 1e-6 * scale, "{k}: {slope} {}", vector[k]);
             }
             prop_assert!((information - information.transpose()).norm() < 1e-9 * information.norm());
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn cofactors_give_the_inverse(m in covariance()) {
-            let product = inverse_of_positive(&m).unwrap() * m;
-            prop_assert!((product - Matrix3::identity()).norm() < 1e-10);
-        }
-    }
-
-    #[test]
-    fn what_is_not_positive_definite_has_no_weight() {
-        let broken = [
-            Matrix3::zeros(),
-            Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0)),
-            Matrix3::from_diagonal(&Vector3::new(-1.0, -1.0, 1.0)),
-            Matrix3::identity() * f64::NAN,
-            Matrix3::identity() * f64::INFINITY,
-        ];
-        for m in broken {
-            assert_eq!(inverse_of_positive(&m), None);
         }
     }
 

@@ -22,7 +22,7 @@ impl MapEstimate {
         world_from_body: &Rotation3<f64>,
         seen: &MapEstimate,
     ) -> Option<Self> {
-        let gain = pair.world_covariance * pair.weight(world_from_body.matrix())?;
+        let gain = pair.world_covariance * pair.weight(world_from_body.matrix())?.matrix();
         let covariance = (Matrix3::identity() - gain) * pair.world_covariance
             + gain * seen.covariance * gain.transpose();
         Some(Self {

@@ -11,11 +11,14 @@ mod least_squares;
 mod map_point;
 mod posterior;
 mod progressive;
+mod symmetric;
 
 pub use crate::distribution::rotation_quadratic::{rotated_vector_by_rotation, vectorize};
+pub(crate) use information::WeightedResidual;
 pub use information::{PointPair, PoseInformation, RobustKernel};
 pub use kabsch::{WeightedPair, weighted_kabsch};
 pub use least_squares::{LeastSquaresConfig, LeastSquaresPose, optimize_pose};
 pub use map_point::MapEstimate;
 pub use posterior::{AlignmentError, PosePosterior, align};
 pub use progressive::align_progressively;
+pub(crate) use symmetric::PointQuadratic;

@@ -524,9 +524,10 @@ impl Tracks {
             Some(points) => points.measure(&seen).is_some(),
             None => filter.update(&pairs).is_some(),
         };
+        let refinement = filter.map_refinement();
         for (point, pair) in seen.iter().zip(&pairs) {
             let refined =
-                filter.refine(pair).filter(|_| updated && treatment != MapTreatment::Fixed);
+                refinement.posterior(pair).filter(|_| updated && treatment != MapTreatment::Fixed);
             if let Some(refined) = refined {
                 self.map.relocate(point.id, refined.position, refined.covariance);
             }

@@ -384,9 +384,10 @@ fn see(
     let (landmarks, pairs): (Vec<usize>, Vec<PointPair>) = matched.unzip();
     let updated = filter.update(&pairs).is_some();
     if updated && treatment == MapTreatment::Uncertain {
+        let refinement = filter.map_refinement();
         let entered = landmarks.into_iter().zip(&pairs).zip(filter.passed());
         for ((landmark, pair), _) in entered.filter(|(_, passed)| **passed) {
-            if let Some(refined) = filter.refine(pair) {
+            if let Some(refined) = refinement.posterior(pair) {
                 map[landmark] = Some(refined);
             }
         }

@@ -13,8 +13,8 @@ pub use bayes::{
     PositionMeasurement, VectorEstimate, VectorMeasurement,
 };
 pub use visual::{
-    Calibration, Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude, MapTreatment,
-    Mekf, MfgFilter, PointState, Rest, Screening, SeenPoint, SlamFilter, UpdateMethod,
-    UpdateOutcome, VisualInertialFilter, calibration_block, choose_points, point_by_pose,
-    pose_covariance,
+    BodyPoints, Calibration, Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude,
+    MapRefinement, MapTreatment, Mekf, MfgFilter, PointState, Rest, Screening, SeenPoint,
+    SlamFilter, UpdateMethod, UpdateOutcome, VisualInertialFilter, calibration_block,
+    choose_points, point_by_pose, pose_covariance,
 };

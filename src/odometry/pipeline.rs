@@ -737,9 +737,10 @@ impl Running {
             }
         };
         if !self.follow_world() && treatment != MapTreatment::Fixed {
+            let refinement = self.filter.map_refinement();
             let passed = self.filter.passed().iter();
             for ((id, pair), _) in pairs.iter().zip(passed).filter(|(_, passed)| **passed) {
-                if let Some(refined) = self.filter.refine(pair) {
+                if let Some(refined) = refinement.posterior(pair) {
                     self.map.relocate(*id, refined.position, refined.covariance);
                 }
             }

@@ -3,8 +3,8 @@
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, SMatrix, SVector, UnitQuaternion, Vector3};
 
-use super::Rest;
-use crate::alignment::{MapEstimate, PointPair, PoseInformation, RobustKernel};
+use super::{BodyPoints, Rest};
+use crate::alignment::{PointPair, PoseInformation, RobustKernel};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::distribution::progressive::{ProgressiveConfig, progressive_update};
 use crate::distribution::regression::{JointInformation, RotationRegression};
@@ -60,10 +60,9 @@ impl BroadBelief {
         &self.attitude
     }
 
-    /// Mean and covariance of the world position of a point that is fixed in the body.
-    pub fn world_point(&self, in_body: &Vector3<f64>) -> MapEstimate {
-        let (position, covariance) = self.density.point_moments(&self.rotation, POSITION, in_body);
-        MapEstimate { position, covariance }
+    /// Where points are that are fixed in the body.
+    pub fn body_points(&self) -> BodyPoints {
+        BodyPoints::of_density(&self.density, &self.rotation)
     }
 
     /// Mode, mean and covariance. The covariance of the rotation is that of the rotation vector
@@ -263,9 +262,9 @@ impl BroadBelief {
 
     /// Conditions the belief on points, with the weights of anisotropic measurements and of the
     /// kernel renewed `relinearizations` times at the mode.
-    pub fn update(
+    pub fn update<'a>(
         &self,
-        pairs: &[PointPair],
+        pairs: impl IntoIterator<Item = &'a PointPair> + Clone,
         kernel: RobustKernel,
         relinearizations: usize,
     ) -> Option<BroadUpdate> {
@@ -276,7 +275,8 @@ impl BroadBelief {
         let mut origin = mean.fixed_rows::<3>(POSITION).into_owned();
         let mut updated = None;
         for _ in 0..=relinearizations {
-            let information = PoseInformation::accumulate(pairs, &mode, &origin, kernel_now);
+            let information =
+                PoseInformation::accumulate(pairs.clone(), &mode, &origin, kernel_now);
             if information.points == 0 {
                 return None;
             }

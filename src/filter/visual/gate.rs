@@ -1,10 +1,10 @@
 //! Which points an update may use.
 
-use nalgebra::{Matrix3, Rotation3};
+use nalgebra::{Isometry3, Rotation3, Vector3};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-use super::{FilterConfig, Screening};
-use crate::alignment::{MapEstimate, PointPair};
+use super::{BodyPoints, FilterConfig, Screening};
+use crate::alignment::{PointPair, PoseInformation, RobustKernel, WeightedResidual};
 
 /// Coordinates of a point.
 const DEGREES_OF_FREEDOM: f64 = 3.0;
@@ -17,8 +17,10 @@ const DEGREES_OF_FREEDOM: f64 = 3.0;
 pub struct Gate {
     /// Squared Mahalanobis distance.
     threshold: f64,
-    /// Kept between updates, so that they do not allocate.
-    accepted: Vec<PointPair>,
+    kernel: RobustKernel,
+    /// The pairs last offered as the predicted pose sees them, `None` if they are unusable. Kept
+    /// between updates, so that they do not allocate.
+    residuals: Vec<Option<WeightedResidual>>,
     /// For each pair offered whether it was accepted.
     passed: Vec<bool>,
 }
@@ -29,34 +31,45 @@ impl Gate {
         let threshold = distribution
             .filter(|_| config.has_gate())
             .map_or(f64::INFINITY, |chi_squared| chi_squared.inverse_cdf(config.gate_probability));
-        Self { threshold, accepted: Vec::new(), passed: Vec::new() }
+        let kernel = config.kernel();
+        Self { threshold, kernel, residuals: Vec::new(), passed: Vec::new() }
     }
 
-    /// Sorts out the points; `world_from_body` turns their covariances, `predicted` gives mean
-    /// and covariance of a point measured exactly.
+    /// Sorts out the points, and sums up what those that passed tell of the pose, weighted as at
+    /// `pose`; `predicted` says where the belief has them.
     pub fn screen(
         &mut self,
         pairs: &[PointPair],
-        world_from_body: &Rotation3<f64>,
-        predicted: impl Fn(&PointPair) -> MapEstimate,
-    ) -> Screening {
-        let distance = |pair: &PointPair| {
-            let seen = predicted(pair);
-            let map =
-                PointPair { world_covariance: pair.world_covariance + seen.covariance, ..*pair };
-            // A pair without a positive definite covariance is refused by the update anyway.
-            let weight = map.weight(world_from_body.matrix()).unwrap_or_else(Matrix3::zeros);
-            let innovation = pair.in_world - seen.position;
-            innovation.dot(&(weight * innovation))
+        pose: &Isometry3<f64>,
+        predicted: &BodyPoints,
+    ) -> (Screening, PoseInformation) {
+        let (rotation, position) = (pose.rotation.to_rotation_matrix(), &pose.translation.vector);
+        let mut residuals = std::mem::take(&mut self.residuals);
+        residuals.clear();
+        residuals.extend(pairs.iter().map(|pair| WeightedResidual::at(pair, &rotation, position)));
+        let (threshold, mut largest) = (self.threshold, 0.0_f64);
+        let distance = |(pair, residual): (&PointPair, &Option<WeightedResidual>)| {
+            let Some(residual) = residual else { return f64::NAN };
+            let innovation = pair.in_world - predicted.position(&pair.in_body);
+            // Were the pose exact the distance would be larger: most points need no more.
+            let bound = residual.weight.quadratic(&innovation);
+            if bound <= threshold.min(largest) {
+                return bound;
+            }
+            let exact = squared_distance(pair, &rotation, predicted, &innovation);
+            largest = largest.max(exact);
+            exact
         };
-        let screening = self.judge(pairs.iter().map(distance));
-        let passed = pairs.iter().zip(&self.passed).filter(|(_, passed)| **passed);
-        self.accepted.clear();
-        self.accepted.extend(passed.map(|(pair, _)| *pair));
-        screening
+        let screening = self.judge(pairs.iter().zip(&residuals).map(distance));
+        let passed = residuals.iter().zip(&self.passed).filter(|(_, passed)| **passed);
+        let entering = passed.filter_map(|(residual, _)| *residual);
+        let information = PoseInformation::sum(entering, position, self.kernel);
+        self.residuals = residuals;
+        (screening, information)
     }
 
-    /// Says of points at these squared Mahalanobis distances from their predictions which pass.
+    /// Says of points at these squared Mahalanobis distances from their predictions which pass;
+    /// one at an undefined distance does not.
     pub fn judge(&mut self, distances: impl Iterator<Item = f64>) -> Screening {
         let mut largest: f64 = 0.0;
         self.passed.clear();
@@ -77,16 +90,45 @@ impl Gate {
         &self.passed
     }
 
-    /// The points that passed.
-    pub fn accepted(&self) -> &[PointPair] {
-        &self.accepted
+    /// Those of the pairs last offered that passed.
+    pub fn accepted<'a>(
+        &'a self,
+        pairs: &'a [PointPair],
+    ) -> impl Iterator<Item = &'a PointPair> + Clone {
+        pairs.iter().zip(&self.passed).filter(|(_, passed)| **passed).map(|(pair, _)| pair)
     }
+}
+
+/// Of an innovation against its covariance, that of the belief included. Zero if that is not
+/// positive definite.
+fn squared_distance(
+    pair: &PointPair,
+    world_from_body: &Rotation3<f64>,
+    predicted: &BodyPoints,
+    innovation: &Vector3<f64>,
+) -> f64 {
+    let covariance =
+        pair.covariance(world_from_body.matrix()) + predicted.covariance().at(&pair.in_body);
+    covariance.inverse_of_positive().map_or(0.0, |weight| weight.quadratic(innovation))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Vector3;
+    use crate::inertial::{Belief, NavCovariance, NavState};
+    use approx::assert_relative_eq;
+    use nalgebra::{Matrix3, UnitQuaternion};
+    use proptest::prelude::*;
+
+    fn belief(pose: Isometry3<f64>, covariance: NavCovariance) -> Belief {
+        let state = NavState {
+            world_from_body: pose,
+            velocity: Vector3::zeros(),
+            gyro_bias: Vector3::zeros(),
+            accel_bias: Vector3::zeros(),
+        };
+        Belief { state, covariance }
+    }
 
     fn pair(error: f64) -> PointPair {
         PointPair {
@@ -97,30 +139,85 @@ mod tests {
         }
     }
 
+    /// At the origin, where a point is known with a variance of 0.01.
     fn screen(gate: &mut Gate, pairs: &[PointPair]) -> Screening {
-        gate.screen(pairs, &Rotation3::identity(), |pair| MapEstimate {
-            position: pair.in_body,
-            covariance: Matrix3::identity() * 0.01,
-        })
+        let mut covariance = NavCovariance::zeros();
+        covariance.fixed_view_mut::<3, 3>(6, 6).copy_from(&(Matrix3::identity() * 0.01));
+        let predicted = BodyPoints::of_belief(&belief(Isometry3::identity(), covariance));
+        gate.screen(pairs, &Isometry3::identity(), &predicted).0
     }
 
     #[test]
     fn improbable_points_stay_out() {
         let mut gate = Gate::new(&FilterConfig::default());
         // Variance 0.04, distance 1.2 is 36 = 6 standard deviations squared.
-        let found = screen(&mut gate, &[pair(0.1), pair(-0.2), pair(1.2)]);
-        assert_eq!((found.rejected, gate.accepted().len()), (1, 2));
+        let pairs = [pair(0.1), pair(-0.2), pair(1.2)];
+        let found = screen(&mut gate, &pairs);
+        assert_eq!((found.rejected, gate.accepted(&pairs).count()), (1, 2));
         assert!((found.largest - 36.0).abs() < 1e-9 && (found.threshold - 30.7).abs() < 0.1);
     }
 
     #[test]
     fn a_wrong_prediction_opens_the_gate() {
         let mut gate = Gate::new(&FilterConfig::default());
-        let found = screen(&mut gate, &[pair(3.0), pair(2.0), pair(0.0)]);
-        assert_eq!((found.rejected, gate.accepted().len()), (0, 3));
+        let pairs = [pair(3.0), pair(2.0), pair(0.0)];
+        let found = screen(&mut gate, &pairs);
+        assert_eq!((found.rejected, gate.accepted(&pairs).count()), (0, 3));
         assert_eq!(found.threshold, f64::INFINITY);
         let mut none =
             Gate::new(&FilterConfig { gate_probability: 0.0, ..FilterConfig::default() });
         assert_eq!(screen(&mut none, &[pair(0.0), pair(9.0)]).rejected, 0);
+    }
+
+    fn vector(range: f64) -> impl Strategy<Value = Vector3<f64>> {
+        proptest::array::uniform3(-range..range).prop_map(Vector3::from)
+    }
+
+    fn covariance() -> impl Strategy<Value = Matrix3<f64>> {
+        proptest::array::uniform9(-0.2..0.2).prop_map(|root| {
+            let root = Matrix3::from_row_slice(&root);
+            root * root.transpose() + Matrix3::identity() * 1e-3
+        })
+    }
+
+    proptest! {
+        /// Points judged by the bound are judged as by their distances, and the sums are those of
+        /// the points that passed.
+        #[test]
+        fn the_bound_changes_nothing(
+            points in proptest::collection::vec(
+                (vector(3.0), covariance(), vector(1.0), covariance()), 1..12),
+            turn in vector(1.5), position in vector(5.0), spread in 0.0..0.3,
+        ) {
+            let pose = Isometry3::from_parts(
+                position.into(), UnitQuaternion::from_scaled_axis(turn));
+            let predicted = BodyPoints::of_belief(
+                &belief(pose, NavCovariance::identity() * (spread * spread)));
+            let pairs: Vec<_> = points.into_iter().map(|(in_body, a, off, b)| PointPair {
+                in_body,
+                body_covariance: a,
+                in_world: (pose * nalgebra::Point3::from(in_body)).coords + off,
+                world_covariance: b,
+            }).collect();
+            let config = FilterConfig { gate_probability: 0.9, ..FilterConfig::default() };
+            let rotation = pose.rotation.to_rotation_matrix();
+            let slow = |pair: &PointPair| {
+                let seen = predicted.at(&pair.in_body);
+                let turned = rotation.matrix() * pair.body_covariance
+                    * rotation.matrix().transpose();
+                let covariance = turned + pair.world_covariance + seen.covariance;
+                let innovation = pair.in_world - seen.position;
+                innovation.dot(&(covariance.try_inverse().unwrap() * innovation))
+            };
+            let (mut fast_gate, mut slow_gate) = (Gate::new(&config), Gate::new(&config));
+            let (fast, information) = fast_gate.screen(&pairs, &pose, &predicted);
+            let expected = slow_gate.judge(pairs.iter().map(slow));
+            prop_assert_eq!(fast_gate.passed(), slow_gate.passed());
+            assert_relative_eq!(fast.largest, expected.largest, max_relative = 1e-9);
+            prop_assert_eq!(fast.rejected, expected.rejected);
+            let apart = PoseInformation::accumulate(
+                fast_gate.accepted(&pairs), &rotation, &position, config.kernel());
+            prop_assert_eq!(information, apart);
+        }
     }
 }

@@ -3,9 +3,7 @@
 use nalgebra::{Matrix6, SMatrix, SVector};
 
 use super::gate::Gate;
-use super::{
-    FilterConfig, Rest, UpdateOutcome, VisualInertialFilter, normalized_innovation, world_point,
-};
+use super::{FilterConfig, Rest, UpdateOutcome, VisualInertialFilter, normalized_innovation};
 use crate::alignment::{PointPair, PoseInformation};
 use crate::inertial::{Belief, ImuSample, Propagator, block, symmetrize};
 use crate::so3::ProperSvd;
@@ -13,7 +11,6 @@ use crate::so3::ProperSvd;
 /// Attitude error in the body frame, one linearisation an update, at the predicted state.
 #[derive(Debug, Clone)]
 pub struct Mekf {
-    config: FilterConfig,
     propagator: Propagator,
     belief: Belief,
     gate: Gate,
@@ -21,7 +18,7 @@ pub struct Mekf {
 
 impl Mekf {
     pub fn new(config: &FilterConfig, propagator: Propagator, belief: Belief) -> Self {
-        Self { config: config.clone(), propagator, belief, gate: Gate::new(config) }
+        Self { propagator, belief, gate: Gate::new(config) }
     }
 
     fn corrected(&self, information: &PoseInformation) -> Option<Belief> {
@@ -63,14 +60,7 @@ impl VisualInertialFilter for Mekf {
 
     fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome> {
         let pose = &self.belief.state.world_from_body;
-        let rotation = pose.rotation.to_rotation_matrix();
-        let kernel = self.config.kernel();
-        let belief = &self.belief;
-        let screening =
-            self.gate.screen(pairs, &rotation, |pair| world_point(belief, &pair.in_body));
-        let pairs = self.gate.accepted();
-        let information =
-            PoseInformation::accumulate(pairs, &rotation, &pose.translation.vector, kernel);
+        let (screening, information) = self.gate.screen(pairs, pose, &self.body_points());
         if information.points == 0 {
             return None;
         }

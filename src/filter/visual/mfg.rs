@@ -7,12 +7,10 @@ use super::broad::{
 };
 use super::gate::Gate;
 use super::{
-    FilterConfig, Rest, UpdateMethod, UpdateOutcome, VisualInertialFilter, normalized_innovation,
-    world_point,
+    BodyPoints, FilterConfig, Rest, UpdateMethod, UpdateOutcome, VisualInertialFilter,
+    normalized_innovation,
 };
-use crate::alignment::{
-    MapEstimate, PointPair, PoseInformation, rotated_vector_by_rotation, vectorize,
-};
+use crate::alignment::{PointPair, PoseInformation, rotated_vector_by_rotation, vectorize};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::inertial::{Belief, ImuSample, Propagator, block};
 use crate::so3::ProperSvd;
@@ -83,8 +81,8 @@ impl MfgFilter {
         moved
     }
 
-    fn update_broad(&mut self, broad: &BroadBelief) -> Option<usize> {
-        let pairs = self.gate.accepted();
+    fn update_broad(&mut self, broad: &BroadBelief, pairs: &[PointPair]) -> Option<usize> {
+        let pairs = self.gate.accepted(pairs);
         let update = broad.update(pairs, self.config.kernel(), self.config.relinearizations)?;
         let points = update.points;
         self.accept_broad(update)?;
@@ -116,7 +114,11 @@ impl MfgFilter {
     }
 
     /// `information` is that of the accepted points at the predicted pose.
-    fn update_concentrated(&mut self, mut information: PoseInformation) -> Option<usize> {
+    fn update_concentrated(
+        &mut self,
+        mut information: PoseInformation,
+        pairs: &[PointPair],
+    ) -> Option<usize> {
         let mut rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
         let mut renewals = self.config.relinearizations;
         let posterior = loop {
@@ -131,16 +133,12 @@ impl MfgFilter {
             }
             renewals -= 1;
             rotation = found;
-            information = self.accumulate(&rotation, &pose.translation.vector);
+            let (pairs, kernel) = (self.gate.accepted(pairs), self.config.kernel());
+            let position = &pose.translation.vector;
+            information = PoseInformation::accumulate(pairs, &rotation, position, kernel);
         };
         self.belief = Some(posterior).filter(Belief::is_finite)?;
         Some(information.points)
-    }
-
-    /// What the accepted points say of the pose, weighted as at the given one.
-    fn accumulate(&self, rotation: &Rotation3<f64>, position: &Vector3<f64>) -> PoseInformation {
-        let kernel = self.config.kernel();
-        PoseInformation::accumulate(self.gate.accepted(), rotation, position, kernel)
     }
 }
 
@@ -178,21 +176,15 @@ impl VisualInertialFilter for MfgFilter {
 
     fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome> {
         let pose = &self.belief.state.world_from_body;
-        let rotation = pose.rotation.to_rotation_matrix();
-        let (belief, broad) = (&self.belief, self.broad.as_deref());
-        let screening = self.gate.screen(pairs, &rotation, |pair| match broad {
-            Some(broad) => broad.world_point(&pair.in_body),
-            None => world_point(belief, &pair.in_body),
-        });
-        let information = self.accumulate(&rotation, &pose.translation.vector);
+        let (screening, information) = self.gate.screen(pairs, pose, &self.body_points());
         if information.points == 0 {
             return None;
         }
         let innovation = normalized_innovation(&information, &self.belief)?;
         let points = match (self.config.update_method, self.broad.clone()) {
             (UpdateMethod::SigmaPoints, _) => self.update_by_sigma_points(&information)?,
-            (UpdateMethod::Exact, Some(broad)) => self.update_broad(&broad)?,
-            (UpdateMethod::Exact, None) => self.update_concentrated(information)?,
+            (UpdateMethod::Exact, Some(broad)) => self.update_broad(&broad, pairs)?,
+            (UpdateMethod::Exact, None) => self.update_concentrated(information, pairs)?,
         };
         Some(UpdateOutcome { innovation, points, screening })
     }
@@ -218,10 +210,10 @@ impl VisualInertialFilter for MfgFilter {
         }
     }
 
-    fn world_point(&self, in_body: &Vector3<f64>) -> MapEstimate {
+    fn body_points(&self) -> BodyPoints {
         match &self.broad {
-            Some(broad) => broad.world_point(in_body),
-            None => world_point(&self.belief, in_body),
+            Some(broad) => broad.body_points(),
+            None => BodyPoints::of_belief(&self.belief),
         }
     }
 }

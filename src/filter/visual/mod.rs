@@ -1,5 +1,6 @@
 //! What all visual-inertial filters share: the trait, the map treatment, the point posteriors.
 
+mod body_points;
 mod broad;
 mod calibration;
 mod gate;
@@ -14,7 +15,7 @@ mod slam;
 use std::fmt;
 use std::str::FromStr;
 
-use nalgebra::{Matrix3, Matrix6, SMatrix, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Matrix6, Rotation3, SMatrix, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::alignment::{MapEstimate, PointPair, PoseInformation, RobustKernel};
@@ -22,6 +23,7 @@ use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block};
 use crate::so3::ProperSvd;
 
+pub use body_points::BodyPoints;
 pub use calibration::{Calibration, calibration_block};
 pub use mekf::Mekf;
 pub use mfg::MfgFilter;
@@ -339,10 +341,9 @@ pub trait VisualInertialFilter: Send {
     /// Parameter of the attitude's matrix Fisher part, if the filter has one.
     fn matrix_fisher(&self) -> Option<ProperSvd>;
 
-    /// Mean and covariance of the world position of a point that is fixed in the body, W22
-    /// (5.84), (5.85).
-    fn world_point(&self, in_body: &Vector3<f64>) -> MapEstimate {
-        world_point(self.belief(), in_body)
+    /// Where the belief has points that are fixed in the body.
+    fn body_points(&self) -> BodyPoints {
+        BodyPoints::of_belief(self.belief())
     }
 
     /// Covariance of the belief in an upright world, its heading being that of the state. Differs
@@ -435,7 +436,7 @@ impl dyn VisualInertialFilter + '_ {
     ) -> MapEstimate {
         let rotation = self.belief().state.world_from_body.rotation.to_rotation_matrix();
         let measured = rotation.matrix() * body_covariance * rotation.matrix().transpose();
-        let seen = self.world_point(in_body);
+        let seen = self.body_points().at(in_body);
         let covariance = match treatment {
             MapTreatment::Fixed => measured,
             MapTreatment::Uncertain | MapTreatment::Correlated => measured + seen.covariance,
@@ -443,26 +444,26 @@ impl dyn VisualInertialFilter + '_ {
         MapEstimate { position: seen.position, covariance }
     }
 
-    /// Posterior of the map point of `pair` given the updated pose; `None` if the pair has no
-    /// positive definite covariance.
-    pub fn refine(&self, pair: &PointPair) -> Option<MapEstimate> {
-        let rotation = self.belief().state.world_from_body.rotation.to_rotation_matrix();
-        MapEstimate::posterior(pair, &rotation, &self.world_point(&pair.in_body))
+    /// What the updated pose says of the map points that it was updated with.
+    pub fn map_refinement(&self) -> MapRefinement {
+        let world_from_body = self.belief().state.world_from_body.rotation.to_rotation_matrix();
+        MapRefinement { world_from_body, seen: self.body_points() }
     }
 }
 
-/// Mean and covariance of `R p' + t` to first order in the rotation error.
-fn world_point(belief: &Belief, in_body: &Vector3<f64>) -> MapEstimate {
-    let pose = &belief.state.world_from_body;
-    let rotation = pose.rotation.to_rotation_matrix();
-    let part = |row: usize, column: usize| belief.covariance.fixed_view::<3, 3>(row, column);
-    let lever = -(rotation.matrix() * in_body.cross_matrix());
-    let cross = lever * part(block::ROTATION, block::POSITION);
-    let covariance = lever * part(block::ROTATION, block::ROTATION) * lever.transpose()
-        + cross
-        + cross.transpose()
-        + part(block::POSITION, block::POSITION);
-    MapEstimate { position: rotation * in_body + pose.translation.vector, covariance }
+/// Posteriors of map points given one pose, see [`MapEstimate::posterior`].
+#[derive(Debug, Clone, Copy)]
+pub struct MapRefinement {
+    world_from_body: Rotation3<f64>,
+    seen: BodyPoints,
+}
+
+impl MapRefinement {
+    /// Posterior of the map point of `pair`; `None` if the pair has no positive definite
+    /// covariance.
+    pub fn posterior(&self, pair: &PointPair) -> Option<MapEstimate> {
+        MapEstimate::posterior(pair, &self.world_from_body, &self.seen.at(&pair.in_body))
+    }
 }
 
 /// Derivative of `R p' + t` by (body-frame rotation error, position), 3x6.
