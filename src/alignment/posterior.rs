@@ -6,7 +6,7 @@ use super::{MapEstimate, PointPair, PoseInformation, RobustKernel};
 use crate::distribution::matrix_fisher_gaussian::{Correlation, MatrixFisherGaussian, MfgError};
 use crate::distribution::regression::RotationRegression;
 use crate::distribution::rotation_quadratic::{RotationMoments, RotationQuadraticError};
-use crate::so3::proper_svd;
+use crate::so3::{angle_between, proper_svd};
 
 /// Times the weights of anisotropic measurements are renewed at most.
 const MAX_RELINEARIZATIONS: usize = 20;
@@ -73,7 +73,7 @@ pub fn align(pairs: &[PointPair]) -> Result<PosePosterior, AlignmentError> {
         let density = density(pairs, &attitude, &origin)?;
         let isotropic = pairs.iter().all(PointPair::is_isotropic_in_body);
         let (mode, _) = density.attitude.global_mode().ok_or(RotationQuadraticError::NotFinite)?;
-        let settled = previous.is_some_and(|last| last.angle_to(&mode) < SETTLED);
+        let settled = previous.is_some_and(|last| angle_between(&last, &mode) < SETTLED);
         (previous, attitude) = (Some(mode), mode);
         if isotropic || settled {
             return PosePosterior::new(origin, density);

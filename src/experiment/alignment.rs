@@ -25,7 +25,7 @@ use crate::alignment::{
 use crate::distribution::progressive::ProgressiveConfig;
 use crate::distribution::rotation_quadratic::vectorize;
 use crate::evaluation::{Curve, Figure};
-use crate::so3::log;
+use crate::so3::{angle_between, log};
 
 /// Sections 5.2.2 and 5.2.4 of W22 without filters.
 pub const STUDIES: &[Study] = &[
@@ -103,15 +103,10 @@ const FIGURE_5_3: [(usize, &str, f64); 7] = [
 
 fn figure_5_3(report: &Report) -> Figure {
     let curve = |filter: &'static str| {
-        let mean = |label: &str| {
-            let mut rows = report.rows.iter();
-            rows.find(|row| {
-                (&*row.case, &*row.filter, &*row.quantity) == (label, filter, "kl_nats")
-            })
+        let point = |&(_, label, n): &(usize, &str, f64)| {
+            Some([n, report.row(label, filter, "kl_nats")?.mean])
         };
-        let points =
-            FIGURE_5_3.iter().filter_map(|(_, label, n)| Some([*n, mean(label)?.mean])).collect();
-        Curve { name: filter.to_owned(), points }
+        Curve { name: filter.to_owned(), points: FIGURE_5_3.iter().filter_map(point).collect() }
     };
     Figure::logarithmic(
         "Figure 5.3: divergence from the posterior of the pose",
@@ -150,17 +145,12 @@ fn study(
 /// The paper's method over least squares, ours (the paper's): all that can be compared of columns
 /// that stand for one unknown draw of map points each.
 fn ratios_to_least_squares(report: &Report) -> Vec<String> {
-    let of = |filter: &str, case: &str, quantity: &str| {
-        let key = (filter, case, quantity);
-        let row = report.rows.iter().find(|r| (&*r.filter, &*r.case, &*r.quantity) == key)?;
-        Some((row.mean, row.paper?))
-    };
     let line = |quantity: &&str| {
         let own = report.rows.iter().filter(|r| r.filter == "mfg-paper" && r.quantity == *quantity);
         let ratios = own.filter_map(|row| {
-            let (ours, paper) = of("mfg-paper", &row.case, quantity)?;
-            let (our_lm, paper_lm) = of("lm", &row.case, quantity)?;
-            Some(format!("{} {:.3} ({:.3})", row.case, ours / our_lm, paper / paper_lm))
+            let lm = report.row(&row.case, "lm", quantity)?;
+            let paper = row.paper? / lm.paper?;
+            Some(format!("{} {:.3} ({paper:.3})", row.case, row.mean / lm.mean))
         });
         let ratios = ratios.collect::<Vec<_>>().join(", ");
         (!ratios.is_empty()).then(|| format!("{quantity}, mfg-paper/lm (the paper's): {ratios}"))
@@ -251,7 +241,7 @@ impl Problem {
             let mut observe = |quantity, value| {
                 trial.observations.push(Observation { case, filter, quantity, value });
             };
-            observe("attitude_deg", found.rotation.angle_to(&self.rotation).to_degrees());
+            observe("attitude_deg", angle_between(&found.rotation, &self.rotation).to_degrees());
             observe("position_m", (found.position - self.position).norm());
             if let Some(certain) = self.certain {
                 let error = |range: std::ops::Range<usize>| {
@@ -533,9 +523,7 @@ mod tests {
     }
 
     fn mean(report: &Report, case: &str, filter: &str, quantity: &str) -> f64 {
-        let key = (case, filter, quantity);
-        let mut rows = report.rows.iter();
-        rows.find(|row| (&*row.case, &*row.filter, &*row.quantity) == key).unwrap().mean
+        report.row(case, filter, quantity).unwrap().mean
     }
 
     #[test]

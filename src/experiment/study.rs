@@ -169,6 +169,12 @@ impl Report {
         let name = name.to_owned();
         Self { name, runs: trials.len(), seed, rows, figures: Vec::new(), notes: Vec::new() }
     }
+
+    /// The first row of that kind.
+    pub fn row(&self, case: &str, filter: &str, quantity: &str) -> Option<&Row> {
+        let key = (case, filter, quantity);
+        self.rows.iter().find(|row| (&*row.case, &*row.filter, &*row.quantity) == key)
+    }
 }
 
 fn row(trials: &[Trial], index: usize, paper: &[PaperValue]) -> Row {

@@ -49,6 +49,14 @@ pub fn log(r: &Rotation3<f64>) -> Vector3<f64> {
     imaginary * (2.0 * sine.atan2(q[0]) / sine)
 }
 
+/// Angle (rad, at most pi) of the turn between two rotations.
+///
+/// Accurate to rounding for equal rotations too, where the arc cosine of the trace (that of
+/// `Rotation3::angle_to`) is off by 1e-8 or undefined.
+pub fn angle_between(a: &Rotation3<f64>, b: &Rotation3<f64>) -> f64 {
+    log(&(a.inverse() * b)).norm()
+}
+
 /// `J_l(v)`: `exp(v + d) = exp(J_l(v) d) exp(v)` to first order in `d`.
 pub fn left_jacobian(v: &Vector3<f64>) -> Matrix3<f64> {
     let squared = v.norm_squared();
@@ -157,6 +165,16 @@ mod tests {
         fn log_keeps_its_digits_near_the_half_turn(axis in direction(), exponent in -14.0..-1.0f64) {
             let v = axis * (PI - 10f64.powf(exponent));
             prop_assert!((log(&exp(&v)) - v).norm() < 4e-15);
+        }
+
+        #[test]
+        fn angles_between_near_rotations_are_exact(
+            v in vector(3.0), axis in direction(), exponent in -12.0..0.0f64,
+        ) {
+            let (r, angle) = (exp(&v), 10f64.powf(exponent));
+            let apart = angle_between(&r, &(r * exp(&(axis * angle))));
+            prop_assert!((apart - angle).abs() < 1e-15, "{} {}", apart, angle);
+            prop_assert!(angle_between(&r, &r) < 1e-15);
         }
 
         #[test]

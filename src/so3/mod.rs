@@ -64,8 +64,8 @@ mod proper_svd;
 mod quaternion;
 
 pub use exponential::{
-    exp, hat, left_jacobian, left_jacobian_inverse, log, right_jacobian, right_jacobian_inverse,
-    vee,
+    angle_between, exp, hat, left_jacobian, left_jacobian_inverse, log, right_jacobian,
+    right_jacobian_inverse, vee,
 };
 pub use haar::{HaarQuadrature, sample_haar};
 pub use polar::proper_polar;

@@ -20,9 +20,16 @@ peers (each from the previous frame alone, poses chained):
                  lens distortion ignored
 """
 EXAMPLE = """\
-example:
+examples:
   tools/compare_peers --filters mfgr,mekfr --out peers-out ../shared/data/tum_fr1_rpy
+  tools/compare_peers --grid --filters mfgs,mfgr,mfgd,mekfs,mekfr,mekfd LOG...   # as in the README
 """
+# APE RMSE (m) by log of an estimator that this tool does not run: monocular, given the true start.
+GIVEN = {
+    "openvins (given)": {
+        "bumper1": 0.0122, "simple1": 0.0192, "motion1": 0.0406, "corridor1": 0.0241,
+    },
+}
 PEERS = ("orb-pnp", "open3d-hybrid")
 COLUMNS = ("log", "estimator", "APE RMSE [m]", "matched", "frames", "lost", "ms/frame")
 
@@ -56,6 +63,9 @@ def parse_arguments():
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="one JSON object instead of the table")
     form.add_argument("--markdown", action="store_true", help="the table in Markdown")
+    form.add_argument("--grid", action="store_true",
+                      help="position errors alone in Markdown, one row a log and one column an "
+                           "estimator, beside the given ones of OpenVINS, which is not run")
     return parser.parse_args()
 
 
@@ -66,13 +76,26 @@ def cells(row):
             str(row.lost), f"{row.ms_per_frame:.1f}")
 
 
-def print_table(rows, markdown):
-    lines = [COLUMNS, *map(cells, rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
-    aligned = [[cell.ljust(width) if i < 2 else cell.rjust(width)
+def grid(rows):
+    """Header and lines of position errors: a row a log, a column an estimator."""
+    errors = {(row.log, row.estimator): "failed" if row.error else f"{row.ape_rmse_m:.4f}"
+              for row in rows}
+    logs = list(dict.fromkeys(row.log for row in rows))
+    for estimator, given in GIVEN.items():
+        errors |= {(log, estimator): f"{given[log]:.4f}" for log in logs if log in given}
+    estimators = list(dict.fromkeys(estimator for _, estimator in errors))
+    lines = [(log, *(errors.get((log, estimator), "-") for estimator in estimators))
+             for log in logs]
+    return [("log", *estimators), *lines]
+
+
+def print_table(lines, names, markdown):
+    """The first line is the header, the first `names` columns are text."""
+    widths = [max(map(len, column)) for column in zip(*lines)]
+    aligned = [[cell.ljust(width) if i < names else cell.rjust(width)
                 for i, (cell, width) in enumerate(zip(line, widths))] for line in lines]
     if markdown:
-        aligned.insert(1, ["-" * width if i < 2 else "-" * (width - 1) + ":"
+        aligned.insert(1, ["-" * width if i < names else "-" * (width - 1) + ":"
                            for i, width in enumerate(widths)])
     for line in aligned:
         print("| " + " | ".join(line) + " |" if markdown else "  ".join(line).rstrip())
@@ -91,8 +114,10 @@ def main():
         sys.exit(f"compare_peers: {error}")
     if arguments.json:
         print(json.dumps(runs.summary(rows), indent=2))
+    elif arguments.grid:
+        print_table(grid(rows), 1, markdown=True)
     else:
-        print_table(rows, arguments.markdown)
+        print_table([COLUMNS, *map(cells, rows)], 2, arguments.markdown)
     sys.exit(any(row.error for row in rows))
 
 

@@ -251,9 +251,7 @@ mod tests {
     }
 
     fn row<'a>(report: &'a Report, case: &str, filter: &str, quantity: &str) -> &'a Row {
-        let key = (case, filter, quantity);
-        let found = |row: &&Row| (&*row.case, &*row.filter, &*row.quantity) == key;
-        report.rows.iter().find(found).unwrap()
+        report.row(case, filter, quantity).unwrap()
     }
 
     /// The paper's second line for the matrix Fisher distribution does not follow from its first.

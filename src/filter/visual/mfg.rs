@@ -13,7 +13,7 @@ use super::{
 use crate::alignment::{PointPair, PoseInformation, rotated_vector_by_rotation, vectorize};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::inertial::{Belief, ImuSample, Propagator, block};
-use crate::so3::ProperSvd;
+use crate::so3::{ProperSvd, angle_between};
 
 /// Least information about a rotation axis from which on the attitude is carried by its mode and
 /// covariance, 1/rad^2.
@@ -128,7 +128,7 @@ impl MfgFilter {
             let posterior = concentrate(&joint, &rotation, &origin)?;
             let pose = &posterior.state.world_from_body;
             let found = pose.rotation.to_rotation_matrix();
-            if renewals == 0 || found.angle_to(&rotation) < SETTLED {
+            if renewals == 0 || angle_between(&found, &rotation) < SETTLED {
                 break posterior;
             }
             renewals -= 1;
