@@ -100,7 +100,7 @@ struct Report {
     fixes_rejected: usize,
     /// Fixes that enlarged the belief.
     surprises: usize,
-    /// s after the first fix; null where the heading has not converged.
+    /// s after the first fix; null where the heading never was that well known.
     heading_converged_s: Option<f64>,
     nis: Option<Consistency>,
     nis_after_convergence: Option<Consistency>,
@@ -283,8 +283,8 @@ fn print(report: &Report, config: &GnssConfig) {
     );
     let limit = config.start.converged_heading_sd;
     match report.heading_converged_s {
-        Some(t) => println!("heading               within {limit} deg (1 sigma) from {t:.2} s on"),
-        None => println!("heading               not within {limit} deg (1 sigma) at the end"),
+        Some(t) => println!("heading               within {limit} deg (1 sigma) after {t:.2} s"),
+        None => println!("heading               never within {limit} deg (1 sigma)"),
     }
     for (what, nis) in [("NIS", &report.nis), ("NIS, heading known", &report.nis_after_convergence)]
     {

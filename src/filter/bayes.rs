@@ -206,6 +206,11 @@ impl VectorMeasurement {
         Ok(world * body.transpose() * self.concentration())
     }
 
+    /// The parameter of the likelihood of several directions.
+    pub fn joint_parameter(measured: &[Self]) -> Result<Matrix3<f64>, FilterError> {
+        measured.iter().map(Self::parameter).sum()
+    }
+
     /// Refuses values that are not finite, and covariances that are not positive.
     pub fn check(&self) -> Result<(), FilterError> {
         finite("measured vector", self.in_world.as_slice())?;

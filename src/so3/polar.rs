@@ -4,8 +4,9 @@ use super::proper_svd::{NotFinite, proper_svd};
 
 /// Newton steps for the largest eigenvalue; it converges from above, quadratically.
 const MAX_STEPS: usize = 20;
-/// Relative step at which the eigenvalue counts as found.
-const CONVERGED: f64 = 1e-14;
+/// Relative step after which the eigenvalue counts as found: what is left is its square, times at
+/// most `0.75/CONDITION`.
+const CONVERGED: f64 = 1e-9;
 /// Smallest `(s1 + s2)(s2 + s3)(s1 + s3)` relative to `(tr S)^3` for which the closed form is
 /// used.
 const CONDITION: f64 = 1e-3;

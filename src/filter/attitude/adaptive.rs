@@ -132,10 +132,7 @@ impl AdaptiveAttitude {
         if let Some(filter) = &mut self.filter {
             return filter.update_directions(measured);
         }
-        let mut parameter = Matrix3::zeros();
-        for direction in measured {
-            parameter += direction.parameter()?;
-        }
+        let parameter = VectorMeasurement::joint_parameter(measured)?;
         let bias = isotropic(self.finder.gyro_bias());
         let prior = AttitudePrior {
             gyro_bias: bias.mean,

@@ -158,11 +158,7 @@ impl BayesFilter for BayesFisher {
     }
 
     fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
-        let mut added = Matrix3::zeros();
-        for vector in measured {
-            added += vector.parameter()?;
-        }
-        self.fuse(&added)
+        self.fuse(&VectorMeasurement::joint_parameter(measured)?)
     }
 
     fn attitude(&self) -> Rotation3<f64> {

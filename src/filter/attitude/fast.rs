@@ -6,7 +6,7 @@ use super::super::bayes::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorMeasurement,
 };
 use super::invariant::conjugated;
-use super::{GyroModel, gaussian_covariance, information_of, symmetric};
+use super::{GyroModel, gaussian_covariance, information_of};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::so3::{exp, hat, proper_polar};
 
@@ -91,14 +91,10 @@ impl FastNonlinear {
             profile += m.in_world * m.in_body.transpose() * weight(m);
         }
         let (solution, k) = proper_polar(&profile)?;
-        let a = information_of(&k);
-        let scale = a.trace();
-        let inverse = a.try_inverse().filter(|_| a.determinant() > UNSOLVABLE * scale.powi(3));
-        let Some(inverse) = inverse else {
-            let parameters = measured.iter().map(VectorMeasurement::parameter);
-            return parameters.sum::<Result<Matrix3<f64>, _>>();
+        let Some(inverse) = inverse_of_symmetric(&information_of(&k), UNSOLVABLE) else {
+            return VectorMeasurement::joint_parameter(measured);
         };
-        let mut covariance = Matrix3::zeros();
+        let mut gradient = Matrix3::zeros();
         for m in measured {
             let known_in_body = match m.measured_in {
                 Frame::Body => solution.inverse_transform_vector(&m.in_world),
@@ -108,9 +104,10 @@ impl FastNonlinear {
                 Frame::Body => m.covariance,
                 Frame::World => conjugated(&solution.inverse(), &m.covariance),
             };
-            let gain = inverse * hat(&known_in_body) * weight(m);
-            covariance += gain * noise_in_body * gain.transpose();
+            let slope = hat(&known_in_body) * weight(m);
+            gradient += slope * noise_in_body * slope.transpose();
         }
+        let covariance = inverse * gradient * inverse;
         Ok(solution.matrix() * parameter_of_covariance(&covariance)?)
     }
 }
@@ -121,8 +118,17 @@ fn weight(m: &VectorMeasurement) -> f64 {
 
 /// `N = tr(P^-1)/2 I - P^-1` (31).
 fn parameter_of_covariance(p: &Matrix3<f64>) -> Result<Matrix3<f64>, FilterError> {
-    let information = p.try_inverse().ok_or(FilterError::NotPositive("covariance"))?;
-    Ok(Matrix3::from_diagonal_element(0.5 * information.trace()) - symmetric(&information))
+    let information = inverse_of_symmetric(p, 0.0).ok_or(FilterError::NotPositive("covariance"))?;
+    Ok(Matrix3::from_diagonal_element(0.5 * information.trace()) - information)
+}
+
+/// The inverse of a symmetric matrix whose determinant exceeds `least` times the cube of its trace.
+fn inverse_of_symmetric(m: &Matrix3<f64>, least: f64) -> Option<Matrix3<f64>> {
+    let (x, y, z) = (m.column(0), m.column(1), m.column(2));
+    let cofactors = Matrix3::from_columns(&[y.cross(&z), z.cross(&x), x.cross(&y)]);
+    let determinant = x.dot(&cofactors.column(0));
+    let inverse = cofactors * determinant.recip();
+    (determinant > least * m.trace().powi(3)).then_some(inverse)
 }
 
 /// The inverse of an information matrix (30), or `fallback` where it is singular.
@@ -130,10 +136,9 @@ fn covariance_of(
     information: &Matrix3<f64>,
     fallback: impl FnOnce() -> Matrix3<f64>,
 ) -> Matrix3<f64> {
-    let scale = information.trace();
-    let regular = information.determinant() > LEAST_INFORMATION * scale.powi(3);
-    let inverse = information.try_inverse().filter(|_| regular && scale > LEAST_INFORMATION);
-    inverse.map_or_else(fallback, |p| symmetric(&p))
+    let inverse = inverse_of_symmetric(information, LEAST_INFORMATION);
+    let known = information.trace() > LEAST_INFORMATION;
+    inverse.filter(|_| known).unwrap_or_else(fallback)
 }
 
 impl BayesFilter for FastNonlinear {

@@ -173,11 +173,7 @@ impl BayesFilter for AttitudeMfg {
     }
 
     fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
-        let mut added = Matrix3::zeros();
-        for vector in measured {
-            added += vector.parameter()?;
-        }
-        self.fuse(&added)
+        self.fuse(&VectorMeasurement::joint_parameter(measured)?)
     }
 
     /// Given the attitude, bias and measurement are Gaussian, and what is left of the likelihood is

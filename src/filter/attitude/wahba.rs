@@ -1,6 +1,6 @@
 //! Attitude from vectors measured at one time, without memory.
 
-use nalgebra::{Matrix3, Rotation3};
+use nalgebra::Rotation3;
 
 use super::super::bayes::{FilterError, VectorMeasurement};
 use crate::so3::project_to_so3;
@@ -10,9 +10,5 @@ use crate::so3::project_to_so3;
 ///
 /// With fewer than two independent directions one of the solutions.
 pub fn wahba(measured: &[VectorMeasurement]) -> Result<Rotation3<f64>, FilterError> {
-    let mut profile = Matrix3::zeros();
-    for vector in measured {
-        profile += vector.parameter()?;
-    }
-    Ok(project_to_so3(&profile)?)
+    Ok(project_to_so3(&VectorMeasurement::joint_parameter(measured)?)?)
 }

@@ -90,7 +90,7 @@ pub struct StartConfig {
     pub heading_sd: f64,
     /// Standard deviation of each component of the velocity about zero, m/s.
     pub velocity_sd: f64,
-    /// The heading counts as converged while its standard deviation is below this, deg.
+    /// The heading counts as converged once its standard deviation is below this, deg.
     pub converged_heading_sd: f64,
 }
 

@@ -62,11 +62,7 @@ impl BayesFilter for MfgGnss {
     }
 
     fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
-        let mut parameter = Matrix3::zeros();
-        for direction in measured {
-            parameter += direction.parameter()?;
-        }
-        self.add_evidence(&parameter)
+        self.add_evidence(&VectorMeasurement::joint_parameter(measured)?)
     }
 
     fn update_position(&mut self, measured: &PositionMeasurement) -> Result<(), FilterError> {

@@ -96,8 +96,7 @@ pub struct NavigationSummary {
     /// Normalized innovations squared of fixes that were used, and the time of each after the
     /// first fix, s.
     pub nis: Vec<(f64, f64)>,
-    /// From when on the heading has been known to `start.converged_heading_sd`, s after the first
-    /// fix.
+    /// When the heading was first known to `start.converged_heading_sd`, s after the first fix.
     pub heading_converged: Option<f64>,
     pub outages: Vec<OutageReport>,
 }
@@ -322,10 +321,8 @@ impl<'a> Run<'a> {
             fix,
         };
         let known = step.heading_sd().to_degrees() <= self.config.start.converged_heading_sd;
-        let since = self.summary.heading_converged.take();
-        if known {
-            let elapsed = stamp.seconds_since(self.summary.start);
-            self.summary.heading_converged = since.or(Some(elapsed));
+        if known && self.summary.heading_converged.is_none() {
+            self.summary.heading_converged = Some(stamp.seconds_since(self.summary.start));
         }
         step
     }
