@@ -49,7 +49,8 @@ impl Gate {
         residuals.extend(pairs.iter().map(|pair| WeightedResidual::at(pair, &rotation, position)));
         let (threshold, mut largest) = (self.threshold, 0.0_f64);
         let distance = |(pair, residual): (&PointPair, &Option<WeightedResidual>)| {
-            let Some(residual) = residual else { return f64::NAN };
+            // Unusable pairs are no evidence against the prediction.
+            let Some(residual) = residual else { return 0.0 };
             let innovation = pair.in_world - predicted.position(&pair.in_body);
             // Were the pose exact the distance would be larger: most points need no more.
             let bound = residual.weight.quadratic(&innovation);
@@ -61,6 +62,9 @@ impl Gate {
             exact
         };
         let screening = self.judge(pairs.iter().zip(&residuals).map(distance));
+        for (passed, residual) in self.passed.iter_mut().zip(&residuals) {
+            *passed &= residual.is_some();
+        }
         let passed = residuals.iter().zip(&self.passed).filter(|(_, passed)| **passed);
         let entering = passed.filter_map(|(residual, _)| *residual);
         let information = PoseInformation::sum(entering, position, self.kernel);
@@ -68,8 +72,7 @@ impl Gate {
         (screening, information)
     }
 
-    /// Says of points at these squared Mahalanobis distances from their predictions which pass;
-    /// one at an undefined distance does not.
+    /// Says of points at these squared Mahalanobis distances from their predictions which pass.
     pub fn judge(&mut self, distances: impl Iterator<Item = f64>) -> Screening {
         let mut largest: f64 = 0.0;
         self.passed.clear();
@@ -167,6 +170,24 @@ mod tests {
         let mut none =
             Gate::new(&FilterConfig { gate_probability: 0.0, ..FilterConfig::default() });
         assert_eq!(screen(&mut none, &[pair(0.0), pair(9.0)]).rejected, 0);
+    }
+
+    #[test]
+    fn what_is_undefined_never_passes() {
+        let mut gate = Gate::new(&FilterConfig::default());
+        let undefined = PointPair { in_world: Vector3::repeat(f64::NAN), ..pair(0.0) };
+        let singular = PointPair {
+            body_covariance: Matrix3::zeros(),
+            world_covariance: Matrix3::zeros(),
+            ..pair(0.0)
+        };
+        for pairs in [[pair(0.0), undefined, singular], [pair(9.0), pair(8.0), undefined]] {
+            let found = screen(&mut gate, &pairs);
+            assert!(found.largest.is_finite());
+            let usable = |pair: &PointPair| pair.in_world.x.is_finite() && *pair != singular;
+            assert_eq!(gate.passed(), pairs.map(|pair| usable(&pair)));
+            assert!(gate.accepted(&pairs).all(usable));
+        }
     }
 
     fn vector(range: f64) -> impl Strategy<Value = Vector3<f64>> {
