@@ -6,7 +6,7 @@ use super::super::bayes::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorMeasurement,
 };
 use super::{AttitudePrior, GyroModel, information_of, symmetric};
-use crate::so3::{exp, hat, log};
+use crate::so3::{exp, hat, left_jacobian_inverse, log};
 
 /// A Gaussian of the rotation vector in the world frame (right-invariant error, `iekf`) or in the
 /// body frame (left-invariant error, `iekf-l`); FNF's rival.
@@ -106,21 +106,22 @@ pub(super) fn linearized_directions(
     Ok((information, vector))
 }
 
-/// The same from a measured attitude; its residual is exact.
+/// The same from a measured attitude. Its residual `z` is a rotation vector, and its derivative is
+/// taken where it is, `log(exp(-e) exp(z)) = z - J_l^-1(z) e`: where the noise is large about some
+/// axis (FNF section V.C), that at zero sends the errors about one of the others to the third.
 pub(super) fn linearized_attitude(
     measured: &AttitudeMeasurement,
     error: Frame,
     attitude: &Rotation3<f64>,
 ) -> Result<(Matrix3<f64>, Vector3<f64>), FilterError> {
     measured.check()?;
-    let in_body = information_of(&symmetric(&measured.noise));
     let residual = log(&(attitude.inverse() * measured.world_from_body));
+    let by_error = left_jacobian_inverse(&residual);
+    let weighted = by_error.transpose() * information_of(&symmetric(&measured.noise));
+    let (information, vector) = (weighted * by_error, weighted * residual);
     Ok(match error {
-        Frame::Body => (in_body, in_body * residual),
-        Frame::World => {
-            let information = conjugated(attitude, &in_body);
-            (information, information * (attitude * residual))
-        }
+        Frame::Body => (information, vector),
+        Frame::World => (conjugated(attitude, &information), attitude * vector),
     })
 }
 

@@ -339,6 +339,28 @@ fn an_unknown_attitude_becomes_known() {
     }
 }
 
+/// Noise of 2.5 rad about one axis says little about it, and must not spoil the others.
+#[test]
+fn an_attitude_measured_badly_about_one_axis_corrects_the_others() {
+    use AttitudeFilterKind::{Iekf, IekfL, Mekf};
+    let start = exp(&Vector3::new(0.4, -1.0, 0.7));
+    let off = Vector3::new(0.0, 0.05, 0.0);
+    let covariance = Matrix3::from_diagonal(&Vector3::new(10.0, 0.01, 0.01));
+    let seen = start * exp(&off) * exp(&Vector3::new(2.5, 0.0, 0.0));
+    let measured = AttitudeMeasurement::from_covariance(seen, &covariance).unwrap();
+    for kind in [Iekf, IekfL, Mekf] {
+        let prior = AttitudePrior {
+            rotation_covariance: Some(Matrix3::from_diagonal_element(0.01)),
+            ..AttitudePrior::matrix_fisher(&(start.matrix() * 50.0)).unwrap()
+        };
+        let mut filter = kind.start(&GyroModel::isotropic(0.01, 1e-4), &prior).unwrap();
+        filter.update_attitude(&measured).unwrap();
+        let left = log(&(filter.attitude().inverse() * start * exp(&off)));
+        // As much is known before as is measured: half of the error or less is left.
+        assert!(left.yz().norm() < 0.5 * off.norm(), "{kind} {left}");
+    }
+}
+
 fn correlated_belief(correlation: Correlation, s: [f64; 3], scale: f64) -> Belief {
     let v = exp(&Vector3::new(-2.0, 0.3, 0.1));
     let u = exp(&Vector3::new(0.4, -1.0, 0.7));
