@@ -578,5 +578,8 @@ mod tests {
         };
         assert!(value("motion", "camera_rotation_deg") < 0.3);
         assert!(value("motion", "camera_time_offset_s") < 2e-3);
+        // A camera at rest shows nothing of its mounting, and the filter knows.
+        assert!((2.5..3.5).contains(&value("rest", "camera_rotation_deg")));
+        assert!(value("rest", "camera_rotation_sd_deg") > 1.3);
     }
 }

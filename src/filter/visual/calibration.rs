@@ -81,10 +81,22 @@ impl Calibration {
         motion: &BodyMotion,
     ) -> [Matrix3<f64>; CALIBRATION_BLOCKS] {
         let from_camera = in_body - self.body_from_camera.translation.vector;
-        let motion = motion.beyond_noise();
         let mut by_offset = Matrix3::zeros();
-        by_offset.set_column(0, &(motion.angular_velocity.cross(in_body) + motion.velocity));
+        by_offset.set_column(0, &motion.of(in_body));
         [-from_camera.cross_matrix(), Matrix3::identity(), by_offset]
+    }
+
+    /// Where a point is in the body that was read off with another calibration, at `in_body`.
+    pub(super) fn reread(
+        &self,
+        before: &Self,
+        in_body: &Vector3<f64>,
+        motion: &BodyMotion,
+    ) -> Vector3<f64> {
+        let (from, to) = (&before.body_from_camera, &self.body_from_camera);
+        let turn = to.rotation * from.rotation.inverse();
+        let seen = turn * (in_body - from.translation.vector) + to.translation.vector;
+        seen + motion.of(in_body) * (self.time_offset - before.time_offset)
     }
 }
 
@@ -104,6 +116,12 @@ impl BodyMotion {
     fn beyond_noise(&self) -> Self {
         let real = |v: &Vector3<f64>| if v.norm() > Self::STILL { *v } else { Vector3::zeros() };
         Self { angular_velocity: real(&self.angular_velocity), velocity: real(&self.velocity) }
+    }
+
+    /// How fast a point at rest comes towards the body, m/s.
+    fn of(&self, in_body: &Vector3<f64>) -> Vector3<f64> {
+        let motion = self.beyond_noise();
+        motion.angular_velocity.cross(in_body) + motion.velocity
     }
 }
 

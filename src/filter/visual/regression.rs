@@ -38,17 +38,21 @@ pub(super) struct Measurement {
     /// Body coordinates, m^2.
     pub body_covariance: Matrix3<f64>,
     pub target: Target,
-    /// Derivative of `in_body` by the blocks of the calibration, where that is part of the state.
-    pub by_calibration: [Matrix3<f64>; CALIBRATION_BLOCKS],
 }
 
 /// What was measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Target {
-    /// A block of the Euclidean part.
+    /// A block of the Euclidean part. Where the calibration is part of the state, too, such a
+    /// block is the point as the camera sees it, mounted as estimated.
     State { block: usize },
-    /// A point known independently of the state, world coordinates (m, m^2).
-    Known { position: Vector3<f64>, covariance: Matrix3<f64> },
+    /// A point known independently of the state, world coordinates (m, m^2), and the derivative
+    /// of its measurement by the blocks of the calibration.
+    Known {
+        position: Vector3<f64>,
+        covariance: Matrix3<f64>,
+        by_calibration: [Matrix3<f64>; CALIBRATION_BLOCKS],
+    },
 }
 
 /// Density of the rotation and the Euclidean part `x` given it (W22 chapter 3, with the
@@ -146,8 +150,12 @@ impl<'a> Regression<'a> {
         measurement: &Measurement,
     ) -> impl Iterator<Item = (usize, Matrix3<f64>)> {
         let turn = *self.prior.matrix();
-        let derivatives = measurement.by_calibration.map(|by_block| turn * by_block);
-        self.calibration.into_iter().flat_map(move |first| (first..).zip(derivatives))
+        let derivatives = match measurement.target {
+            Target::State { .. } => None,
+            Target::Known { by_calibration, .. } => Some(by_calibration.map(|by| turn * by)),
+        };
+        let blocks = self.calibration.zip(derivatives);
+        blocks.into_iter().flat_map(|(first, derivatives)| (first..).zip(derivatives))
     }
 
     /// Squared Mahalanobis distance of each measurement from what is expected of it.

@@ -24,10 +24,6 @@ struct StatePoint {
     id: u64,
     /// World coordinates, m.
     position: Vector3<f64>,
-    /// Where it was when it entered. The calibration's derivatives are taken there for ever: taken
-    /// where the point is seen, they would differ by its noise from frame to frame, and what does
-    /// not differ between frames would seem to be measured.
-    entered_at: Point3<f64>,
 }
 
 /// Visual-inertial filter whose Euclidean state is `(v, p, b_g, b_a, l_1 ... l_M)`, after `b_a` the
@@ -36,7 +32,10 @@ struct StatePoint {
 /// A point `l` of the state measured at `p'` in the body frame is `0 = R p' + p - l + noise`.
 /// Between updates the belief is the mode and the covariance of the error around it, as in
 /// [`Belief`], points in world coordinates; an update works on the regression of the Euclidean
-/// part on the rotation ([`Regression`]), in one of two [`Coordinates`].
+/// part on the rotation ([`Regression`]), in one of two [`Coordinates`]. Where the calibration is part
+/// of the state, an update works on points as the camera sees them, which a turn of the mounting
+/// carries along: from a place that does not change nothing is measured of the calibration, however
+/// pose and points are corrected.
 ///
 /// With `n = 15 + 3 M` an update with `m` points costs `O(n^2 m)`, a propagation step `O(15^3)`:
 /// what it does to the correlations with the points is gathered and done at the next update.
@@ -59,6 +58,8 @@ pub struct SlamFilter {
     /// The camera's calibration as part of the state, following gravity, if it is uncertain. Its
     /// covariance is that of the last update.
     calibration: Option<Calibration>,
+    /// By which the present pose is timed.
+    timed_by: Option<Calibration>,
     /// Angular velocity as last measured, rad/s.
     measured_rate: Vector3<f64>,
     /// Whether the heading is that of an arbitrary world: uniform, and independent of all else.
@@ -88,6 +89,7 @@ impl SlamFilter {
             transition: NavCovariance::identity(),
             gravity: None,
             calibration: None,
+            timed_by: None,
             measured_rate: Vector3::zeros(),
             heading_is_free: false,
             gate: Gate::new(config),
@@ -132,16 +134,54 @@ impl SlamFilter {
         self.calibration_rows().end
     }
 
-    /// Derivative of a point of the world as measured in the body by the blocks of the
-    /// calibration.
-    fn by_calibration(&self, point: &Point3<f64>) -> Option<[Matrix3<f64>; CALIBRATION_BLOCKS]> {
+    fn motion(&self) -> BodyMotion {
         let state = &self.belief.state;
-        let in_body = state.world_from_body.inverse_transform_point(point).coords;
-        let motion = BodyMotion {
+        BodyMotion {
             angular_velocity: self.measured_rate - state.gyro_bias,
             velocity: state.world_from_body.rotation.inverse() * state.velocity,
-        };
-        Some(self.calibration.as_ref()?.derivatives(&in_body, &motion))
+        }
+    }
+
+    /// Derivative of a point of the world as measured in the body by the blocks of the
+    /// calibration.
+    fn by_calibration(&self, point: &Vector3<f64>) -> Option<[Matrix3<f64>; CALIBRATION_BLOCKS]> {
+        let pose = &self.belief.state.world_from_body;
+        let in_body = pose.inverse_transform_point(&Point3::from(*point)).coords;
+        Some(self.calibration.as_ref()?.derivatives(&in_body, &self.motion()))
+    }
+
+    /// The covariance with points as the camera sees them in place of points of the world
+    /// (`sign` -1), or back (1): they differ by what the calibration moves them.
+    fn with_camera(&self, mut covariance: DMatrix<f64>, sign: f64) -> DMatrix<f64> {
+        let rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
+        let calibration = self.calibration_rows();
+        for (slot, point) in self.points.iter().enumerate() {
+            let (row, Some(by_calibration)) =
+                (self.row(slot), self.by_calibration(&point.position))
+            else {
+                continue;
+            };
+            for (from, by_block) in calibration.clone().step_by(3).zip(by_calibration) {
+                let by_block = rotation * by_block * sign;
+                let moved = by_block * covariance.fixed_rows::<3>(from);
+                let mut rows = covariance.fixed_rows_mut::<3>(row);
+                rows += moved;
+                let moved = covariance.fixed_columns::<3>(from) * by_block.transpose();
+                let mut columns = covariance.fixed_columns_mut::<3>(row);
+                columns += moved;
+            }
+        }
+        covariance
+    }
+
+    /// A point measured in the body, where it is by what is known of the clock since the pose was
+    /// timed.
+    fn retimed(&self, in_body: &Vector3<f64>) -> Vector3<f64> {
+        let calibrations = self.calibration.as_ref().zip(self.timed_by.as_ref());
+        calibrations.map_or(*in_body, |(now, then)| {
+            let timed = Calibration { time_offset: then.time_offset, ..*now };
+            now.reread(&timed, in_body, &self.motion())
+        })
     }
 
     fn synchronize(&mut self) {
@@ -185,10 +225,10 @@ impl SlamFilter {
         let prior = self.belief.state.world_from_body.rotation.to_rotation_matrix();
         let means = self.euclidean();
         let calibration = self.calibration.map(|_| self.after_gravity() / 3 - 1);
-        let of_prior = || {
-            let covariance = &self.covariance;
-            Regression::of_prior(self.coordinates, &prior, &means, calibration, covariance)
-        };
+        let seen = calibration.map(|_| self.with_camera(self.covariance.clone(), -1.0));
+        let covariance = seen.as_ref().unwrap_or(&self.covariance);
+        let of_prior =
+            || Regression::of_prior(self.coordinates, &prior, &means, calibration, covariance);
         let mut regression = of_prior()?;
         let screening = self.gate.judge(regression.squared_distances(measurements)?.into_iter());
         let passed = measurements.iter().zip(self.gate.passed()).filter(|(_, passed)| **passed);
@@ -240,11 +280,8 @@ impl SlamFilter {
         if !(finite && belief.is_finite()) {
             return None;
         }
+        let (motion, before) = (self.motion(), self.calibration);
         self.belief = belief;
-        let points = means.iter().skip(self.base() / 3 - 1);
-        for (point, position) in self.points.iter_mut().zip(points) {
-            point.position = *position;
-        }
         if let (Some(gravity), Some(mean)) = (&mut self.gravity, means.get(NAVIGATION / 3 - 1)) {
             gravity.mean = *mean;
             gravity.follow(&covariance);
@@ -258,7 +295,16 @@ impl SlamFilter {
             calibration.covariance =
                 covariance.fixed_view::<7, 7>(rows.start, rows.start).into_owned();
         }
-        self.covariance = covariance;
+        let (pose, base) = (belief.state.world_from_body, self.base() / 3 - 1);
+        for (point, position) in self.points.iter_mut().zip(means.iter().skip(base)) {
+            point.position = *position;
+            if let Some((now, before)) = self.calibration.as_ref().zip(before.as_ref()) {
+                let in_body = pose.inverse_transform_point(&Point3::from(*position)).coords;
+                let reread = now.reread(before, &in_body, &motion);
+                point.position = (pose * Point3::from(reread)).coords;
+            }
+        }
+        self.covariance = self.with_camera(covariance, 1.0);
         Some(())
     }
 
@@ -282,7 +328,7 @@ impl SlamFilter {
         covariance.view_mut((0, n), (n, 3)).copy_from(&rows.transpose());
         covariance.view_mut((n, n), (3, 3)).copy_from(&((own + own.transpose()) * 0.5));
         self.covariance = covariance;
-        self.points.push(StatePoint { id, position, entered_at: position.into() });
+        self.points.push(StatePoint { id, position });
         true
     }
 
@@ -325,7 +371,6 @@ impl SlamFilter {
         state.velocity = turn * state.velocity;
         for point in &mut self.points {
             point.position = turn * point.position;
-            point.entered_at = turn * point.entered_at;
         }
         if let Some(gravity) = &mut self.gravity {
             gravity.mean = turn * gravity.mean;
@@ -352,6 +397,8 @@ impl SlamFilter {
     /// the covariance is that after it.
     fn shift(&mut self, change: &DVector<f64>) {
         let part = |start: usize| change.fixed_rows::<3>(start).into_owned();
+        let covariance = std::mem::take(&mut self.covariance);
+        let covariance = self.with_camera(covariance, -1.0);
         let navigation = change.fixed_rows::<NAVIGATION>(0).into_owned();
         self.belief.state = self.belief.state.corrected_by(&navigation);
         let base = self.base();
@@ -363,8 +410,9 @@ impl SlamFilter {
             let blocks = calibration.blocks();
             let moved = std::array::from_fn(|k| blocks[k] + part(row + 3 * k));
             *calibration = calibration.moved(moved);
-            calibration.covariance = self.covariance.fixed_view::<7, 7>(row, row).into_owned();
+            calibration.covariance = covariance.fixed_view::<7, 7>(row, row).into_owned();
         }
+        self.covariance = self.with_camera(covariance, 1.0);
     }
 
     /// The Kalman filter's update, to first order in the rotation.
@@ -456,6 +504,7 @@ impl VisualInertialFilter for SlamFilter {
         let step = self.propagator.propagate_with_transition(&mut self.belief, from, to);
         if let Some(step) = step {
             self.measured_rate = to.angular_velocity;
+            self.timed_by = self.calibration;
             self.transition = step * self.transition;
             if let Some(gravity) = &mut self.gravity {
                 gravity.propagate(&mut self.belief, &step, to.stamp.seconds_since(from.stamp));
@@ -477,11 +526,11 @@ impl VisualInertialFilter for SlamFilter {
             .iter()
             .map(|pair| {
                 let (position, covariance) = (pair.in_world, pair.world_covariance);
+                let by_calibration = self.by_calibration(&position).unwrap_or_default();
                 Measurement {
-                    in_body: pair.in_body,
+                    in_body: self.retimed(&pair.in_body),
                     body_covariance: pair.body_covariance,
-                    target: Target::Known { position, covariance },
-                    by_calibration: self.by_calibration(&position.into()).unwrap_or_default(),
+                    target: Target::Known { position, covariance, by_calibration },
                 }
             })
             .collect();
@@ -570,12 +619,10 @@ impl PointState for SlamFilter {
     fn measure(&mut self, seen: &[SeenPoint]) -> Option<UpdateOutcome> {
         let measurement = |point: &SeenPoint| {
             let slot = self.slot(point.id)?;
-            let entered_at = &self.points.get(slot)?.entered_at;
             Some(Measurement {
-                in_body: point.in_body,
+                in_body: self.retimed(&point.in_body),
                 body_covariance: point.body_covariance,
                 target: Target::State { block: self.base() / 3 - 1 + slot },
-                by_calibration: self.by_calibration(entered_at).unwrap_or_default(),
             })
         };
         let measurements: Vec<_> = seen.iter().filter_map(measurement).collect();
@@ -596,11 +643,12 @@ impl PointState for SlamFilter {
         self.synchronize();
         let pose = self.belief.state.world_from_body;
         let rotation = pose.rotation.to_rotation_matrix();
-        let j = point_by_pose(rotation.matrix(), &point.in_body);
+        let in_body = self.retimed(&point.in_body);
+        let j = point_by_pose(rotation.matrix(), &in_body);
         let (by_rotation, by_position) = (j.fixed_columns::<3>(0), j.fixed_columns::<3>(3));
         let n = self.covariance.ncols();
-        let position = rotation * point.in_body + pose.translation.vector;
-        let calibration = self.by_calibration(&position.into()).into_iter().flatten();
+        let position = rotation * in_body + pose.translation.vector;
+        let calibration = self.by_calibration(&position).into_iter().flatten();
         let terms: Vec<(usize, Matrix3<f64>)> = [
             (block::ROTATION, by_rotation.into_owned()),
             (block::POSITION, by_position.into_owned()),
@@ -918,6 +966,68 @@ mod tests {
         assert!(before.rotation.angle_to(&after.rotation) < 1e-9);
         assert!((before.translation.vector - after.translation.vector).norm() < 1e-9);
         assert!(!filter(FilterKind::Mfgr, prior).calibrate(&calibration));
+    }
+
+    /// Nor at rest while tilt, velocity and biases are being found, and rest is measured as well:
+    /// all that is left is of second order in the velocity of the first frames.
+    #[test]
+    fn at_rest_the_calibration_stays_as_it_was() {
+        let mut rng = ChaCha8Rng::seed_from_u64(29);
+        let imu = ImuConfig::default();
+        let mut covariance = NavCovariance::identity() * 1e-6;
+        for (start, sd) in [(0, 0.03), (3, 0.1), (9, imu.gyro_bias_sd), (12, imu.accel_bias_sd)] {
+            (start..start + 3).for_each(|k| covariance[(k, k)] = sd * sd);
+        }
+        let state = NavState {
+            world_from_body: Isometry3::rotation(normal(&mut rng) * 0.03),
+            velocity: normal(&mut rng) * 0.1,
+            gyro_bias: Vector3::zeros(),
+            accel_bias: Vector3::zeros(),
+        };
+        let gravity = Vector3::new(0.0, 0.0, imu.gravity);
+        let sample = |step: i64, rng: &mut ChaCha8Rng| ImuSample {
+            stamp: Stamp::from_nanos(step * 5_000_000),
+            angular_velocity: normal(rng) * (imu.gyro_noise / 0.005f64.sqrt()),
+            specific_force: gravity + normal(rng) * (imu.accel_noise / 0.005f64.sqrt()),
+        };
+        for kind in [FilterKind::Mfgs, FilterKind::Mekfs] {
+            let mut rng = rng.clone();
+            let prior = uncertain_calibration();
+            let mut filter = filter(kind, Belief { state, covariance });
+            assert!(filter.calibrate(&prior));
+            let in_camera: Vec<_> =
+                (0..25).map(|_| vector(&mut rng, 1.5) + Vector3::new(0.0, 0.0, 2.5)).collect();
+            let noise = Matrix3::identity() * 0.01f64.powi(2);
+            let mut last = sample(0, &mut rng);
+            for frame in 0..90 {
+                for step in 1..=7 {
+                    let next = sample(7 * frame + step, &mut rng);
+                    assert!(filter.propagate(&last, &next));
+                    last = next;
+                }
+                let mounting = filter.calibration().unwrap().body_from_camera;
+                let see = |(id, exact): (usize, &Vector3<f64>), rng: &mut ChaCha8Rng| {
+                    let point = mounting * Point3::from(exact + normal(rng) * 0.01);
+                    seen(id as u64, point.coords, noise)
+                };
+                let points: Vec<_> =
+                    in_camera.iter().enumerate().map(|p| see(p, &mut rng)).collect();
+                let state = filter.point_state().unwrap();
+                match frame {
+                    0 => assert!(points.iter().all(|point| state.admit(point))),
+                    _ => assert!(state.measure(&points).is_some()),
+                }
+                let rest = Rest { rate: Vector3::zeros(), velocity_sd: 0.02, rate_sd: 0.02 };
+                assert!(frame < 30 || filter.rest(&rest));
+            }
+            let found = filter.calibration().unwrap();
+            for (k, sd) in found.standard_deviations().into_iter().enumerate() {
+                let before = prior.standard_deviations()[k];
+                assert!((sd / before - 1.0).abs() < 0.02, "{kind} {k}: {before} {sd}");
+            }
+            let turned = found.body_from_camera.rotation.angle_to(&prior.body_from_camera.rotation);
+            assert!(turned < 0.2 * prior.standard_deviations()[0], "{kind}: {turned}");
+        }
     }
 
     #[test]
