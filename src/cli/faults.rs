@@ -62,6 +62,9 @@ pub fn run(args: &FaultsArgs) -> anyhow::Result<()> {
         if INTERRUPTED.load(Ordering::Relaxed) {
             break;
         }
+        if fault.is_none() {
+            check_within(&faults, outcome.seconds)?;
+        }
         outcomes.push(outcome);
     }
     let output = match args.json {
@@ -72,6 +75,18 @@ pub fn run(args: &FaultsArgs) -> anyhow::Result<()> {
         false => table(&outcomes).to_text().trim_end().to_owned(),
     };
     Ok(writeln!(std::io::stdout(), "{output}")?)
+}
+
+/// An error if there is a fault that never happens.
+fn check_within(faults: &[Fault], seconds: f64) -> anyhow::Result<()> {
+    let late: Vec<_> =
+        faults.iter().filter(|f| f.start >= seconds).map(|f| format!("`{f}`")).collect();
+    anyhow::ensure!(
+        late.is_empty(),
+        "the replayed part of the log ends after {seconds:.2} s, before {} begins",
+        late.join(", ")
+    );
+    Ok(())
 }
 
 /// A failed run is an outcome; what prevents all of them is an error.

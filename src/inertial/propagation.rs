@@ -33,6 +33,9 @@ pub struct Propagator {
     gap_gyro_noise: f64,
     gap_accel_noise: f64,
     in_gap: bool,
+    /// Standard deviations of the biases of a start; 0 without an IMU.
+    gyro_bias_sd: f64,
+    accel_bias_sd: f64,
 }
 
 impl Propagator {
@@ -47,6 +50,8 @@ impl Propagator {
             gap_gyro_noise: config.gap_gyro_noise,
             gap_accel_noise: config.gap_accel_noise,
             in_gap: false,
+            gyro_bias_sd: config.gyro_bias_sd,
+            accel_bias_sd: config.accel_bias_sd,
         }
     }
 
@@ -63,6 +68,8 @@ impl Propagator {
             gap_gyro_noise: 0.0,
             gap_accel_noise: acceleration,
             in_gap: false,
+            gyro_bias_sd: 0.0,
+            accel_bias_sd: 0.0,
         }
     }
 
@@ -170,6 +177,23 @@ impl Propagator {
     /// World coordinates, m/s^2; zero for the constant velocity model.
     pub fn gravity(&self) -> &Vector3<f64> {
         &self.gravity
+    }
+
+    /// Covariance of what the error of the last `h` seconds is beyond that of the model, where the
+    /// IMU turns out to be wrong: as that of a gap, and of biases that have changed by several
+    /// times their standard deviations at a start. `None` without an IMU.
+    pub fn distrust(&self, h: f64) -> Option<NavCovariance> {
+        const BIAS_CHANGE: f64 = 3.0;
+        if self.model != MotionModel::Inertial {
+            return None;
+        }
+        let mut covariance = Self { in_gap: true, ..self.clone() }.noise(h);
+        for (start, sd) in
+            [(block::GYRO_BIAS, self.gyro_bias_sd), (block::ACCEL_BIAS, self.accel_bias_sd)]
+        {
+            (start..start + 3).for_each(|k| covariance[(k, k)] += (BIAS_CHANGE * sd).powi(2));
+        }
+        Some(covariance)
     }
 
     fn step(

@@ -5,7 +5,7 @@ mod index;
 
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Isometry3, Matrix3, Point3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::vision::{Descriptor, Patch, PinholeCamera};
@@ -192,15 +192,15 @@ impl Map {
         true
     }
 
-    /// Turns the world, and all points with it, about the origin.
-    pub fn turn(&mut self, turn: &UnitQuaternion<f64>) {
-        let matrix = turn.to_rotation_matrix().into_inner();
+    /// Moves all points, and the views that they were seen from, by a motion of the world.
+    pub fn carry(&mut self, motion: &Isometry3<f64>) {
+        let matrix = motion.rotation.to_rotation_matrix().into_inner();
         for point in &mut self.points {
-            point.position = turn * point.position;
-            point.view_direction = turn * point.view_direction;
+            point.position = (motion * Point3::from(point.position)).coords;
+            point.view_direction = motion.rotation * point.view_direction;
             point.covariance = matrix * point.covariance * matrix.transpose();
             if let Some(reference) = &mut point.reference {
-                reference.world_from_camera = turn * reference.world_from_camera;
+                reference.world_from_camera = motion * reference.world_from_camera;
             }
         }
         self.index.invalidate();
@@ -257,7 +257,7 @@ impl Map {
             distance >= self.config.min_distance
                 && distance <= self.config.max_distance
                 && ray.dot(&point.view_direction) >= min_cos * distance
-                && frustum.contains(&(camera_from_world * nalgebra::Point3::from(point.position)))
+                && frustum.contains(&(camera_from_world * Point3::from(point.position)))
         };
         let (centre, radius) = frustum.bounding_sphere(self.config.max_distance);
         let centre = (world_from_camera * centre).coords;
@@ -281,6 +281,7 @@ fn direction(from: &Vector3<f64>, to: &Vector3<f64>) -> Option<Vector3<f64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::UnitQuaternion;
     use proptest::prelude::*;
 
     const CAMERA: PinholeCamera = PinholeCamera { fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 };

@@ -103,6 +103,8 @@ pub struct Evidence<'a> {
     /// Stamp of the newest event.
     pub now: Stamp,
     pub ended: bool,
+    /// For a new start in the course of a run: the attitude that the gyroscope has carried on.
+    pub attitude: Option<UnitQuaternion<f64>>,
 }
 
 /// Settings that the start depends on.
@@ -223,12 +225,12 @@ impl Initializer {
             imu.get(start..end).unwrap_or_default()
         };
         if !covered(self.standstill.window) {
-            return match evidence.ended {
-                false => Attempt::Wait,
-                true => Attempt::NextFrame(format!(
-                    "the IMU data end within {} s of this frame",
-                    self.standstill.window
-                )),
+            let reason =
+                format!("the IMU data end within {} s of this frame", self.standstill.window);
+            return match (evidence.ended, evidence.attitude) {
+                (false, _) => Attempt::Wait,
+                (true, Some(attitude)) => self.carried_on(attitude, &reason),
+                (true, None) => Attempt::NextFrame(reason),
             };
         }
         let Some(check) = StandstillCheck::measure(window(self.standstill.window)) else {
@@ -246,6 +248,20 @@ impl Initializer {
             return Attempt::Wait;
         }
         self.levelled(window(self.init.moving_window), &check, false)
+    }
+
+    /// Where it is too late to be levelled.
+    fn carried_on(&self, attitude: UnitQuaternion<f64>, reason: &str) -> Attempt {
+        let attitude = InitialAttitude {
+            world_from_body: attitude,
+            gyro_bias: Vector3::zeros(),
+            covariance: Matrix3::identity() * self.filter.moving_tilt_sd_deg.to_radians().powi(2),
+        };
+        Attempt::Ready {
+            belief: Box::new(self.belief(&attitude, self.filter.moving_velocity_sd, true)),
+            known: KnownAttitude::All,
+            how: format!("{reason}: the attitude is the old one"),
+        }
     }
 
     fn levelled(&self, samples: &[ImuSample], check: &StandstillCheck, still: bool) -> Attempt {

@@ -1,7 +1,9 @@
 use std::collections::VecDeque;
 use std::time::Instant;
 
-use nalgebra::{Isometry3, Matrix2, Matrix3, Point2, Point3, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{
+    Isometry3, Matrix2, Matrix3, Point2, Point3, Translation3, UnitQuaternion, Vector2, Vector3,
+};
 
 use super::health::{Divergence, Health, HealthSummary, Sight};
 use super::init::{Attempt, Evidence, Initializer};
@@ -9,7 +11,7 @@ use super::report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
 use super::rest::RestDetector;
-use super::restart::Legacy;
+use super::restart::{Legacy, Spread};
 use super::truth::TruthTrack;
 use super::watch::{Agreement, SensorWatch};
 use super::{OdometryConfig, TruthPose, renew_state_points};
@@ -18,11 +20,12 @@ use crate::filter::{
     Calibration, FilterKind, KnownAttitude, MapTreatment, PointState, SeenPoint, UpdateOutcome,
     VisualInertialFilter, point_by_pose,
 };
-use crate::inertial::{Belief, ImuSample, Propagator, Stamp};
+use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, Stamp};
 use crate::map::{Map, MapPoint, ReferenceView, Sighting};
+use crate::so3::ProperSvd;
 use crate::vision::{
     Correspondence, DepthReading, Feature, Match, PinholeCamera, PointMeasurement, Prediction,
-    RgbdFrame, estimate_pose, match_guided,
+    RgbdFrame, agree_near, agreeing, estimate_pose, match_guided,
 };
 
 /// A frame whose features have been found.
@@ -89,6 +92,9 @@ pub struct OdometryStats {
 /// How long a frame waits for the IMU to reach it before the gap is bridged, s.
 const IMU_PATIENCE: f64 = 1.0;
 
+/// Fewer matches than this may agree on a pose by chance.
+const FEW_ASTRAY: usize = 30;
+
 /// What exists once the filter has started.
 struct Running {
     filter: Box<dyn VisualInertialFilter>,
@@ -110,6 +116,9 @@ struct Running {
     /// The start, until the vertical is known.
     vertical_sought_since: Option<Stamp>,
     rest: RestDetector,
+    /// What is not known of where this start is in the world of the first one. It is no part of
+    /// the belief: nothing that is measured can tell of it.
+    spread: Spread,
 }
 
 impl Odometry {
@@ -287,6 +296,7 @@ impl Odometry {
             first_frame,
             now: self.now?,
             ended: self.ended,
+            attitude: self.legacy.as_ref().map(|legacy| legacy.attitude),
         };
         let attempt = match self.legacy {
             Some(_) => self.initializer.anew().attempt(&evidence),
@@ -308,7 +318,8 @@ impl Odometry {
                 self.waiting_reason = None;
                 let text = match self.legacy.take() {
                     Some(legacy) => {
-                        let map = if legacy.map.is_some() { "kept" } else { "dropped" };
+                        let kept = legacy.map.is_some();
+                        let map = if kept { "kept" } else { "dropped, heading and place unknown" };
                         let text = format!("re-initialised at {first_frame} s: {how}; map {map}");
                         self.start_anew(*belief, legacy, first_frame);
                         text
@@ -355,6 +366,7 @@ impl Odometry {
             last_sample: last_imu.map(|sample| sample.stamp),
             told_gap_after: None,
             rest: RestDetector::new(&self.config.standstill, &self.config.imu),
+            spread: Spread::default(),
         });
     }
 
@@ -367,6 +379,7 @@ impl Odometry {
             sound: self.sound.unwrap_or((stamp, belief)),
             attitude: belief.state.world_from_body.rotation,
             map: Legacy::keeps_map(divergence).then_some(running.map),
+            spread: running.spread,
             seeing_frames: running.seeing_frames,
             last_sample: running.last_sample,
         });
@@ -374,9 +387,11 @@ impl Odometry {
 
     fn start_anew(&mut self, belief: Belief, legacy: Legacy, time: Stamp) {
         let belief = legacy.place(belief, time, self.has_imu, &self.config.filter);
+        let spread = legacy.spread(self.config.health.max_position_sd);
         self.health.restarted(&belief);
         self.start(belief, KnownAttitude::All, time);
         if let Some(running) = &mut self.running {
+            running.spread = spread;
             running.last_sample = running.last_sample.or(legacy.last_sample);
             if let Some(map) = legacy.map {
                 running.expects_matches = !map.is_empty();
@@ -414,7 +429,7 @@ impl Odometry {
         let (candidates, matches) = running.find_matches(features, &view);
         times.matching = clock.lap();
 
-        let inliers = running.find_inliers(&matches, &view);
+        let (inliers, others) = running.find_inliers(&matches, &view);
         times.ransac = clock.lap();
 
         let treatment = self.kind.map_treatment();
@@ -436,11 +451,11 @@ impl Odometry {
         notes.extend(self.health.see(stamp, sight));
         notes.extend(running.judge_rest(stamp, &matches, &inliers, &view));
         let belief = running.filter.belief();
-        let opened = updated.is_some_and(|outcome| outcome.screening.threshold.is_infinite());
         let agreement = Agreement {
             matches: matches.len(),
             inliers: inliers.len(),
-            contradicted: opened && view.config.filter.has_gate(),
+            others,
+            contradicted: updated.is_some_and(|outcome| outcome.contradicts()),
         };
         notes.extend(self.watch.agreement(stamp, agreement, &belief.state));
         let innovation = updated.map(|outcome| outcome.innovation);
@@ -471,10 +486,10 @@ impl Odometry {
             frame: number,
             stamp: front.frame.stamp,
             state: belief.state,
-            covariance: running.filter.reported_covariance(),
+            covariance: running.reported_covariance(),
             world_from_camera: running.world_from_camera(&view),
             calibration: running.filter.calibration().copied(),
-            matrix_fisher: running.filter.matrix_fisher(),
+            matrix_fisher: running.matrix_fisher(),
             innovation,
             screening: updated.map(|outcome| outcome.screening),
             counts: StepCounts {
@@ -614,6 +629,22 @@ impl Running {
         self.filter.belief().state.world_from_body * view.body_from_camera
     }
 
+    /// Of the error in the world of the first start, whose vertical is up.
+    fn reported_covariance(&self) -> NavCovariance {
+        let state = &self.filter.belief().state;
+        self.filter.reported_covariance() + self.spread.covariance(state)
+    }
+
+    fn matrix_fisher(&self) -> Option<ProperSvd> {
+        let known = self.filter.matrix_fisher()?;
+        if self.spread == Spread::default() {
+            return Some(known);
+        }
+        let state = self.filter.belief().state;
+        let reported = Belief { state, covariance: self.reported_covariance() };
+        reported.attitude().map(|attitude| *attitude.svd())
+    }
+
     fn camera_motion(&self, view: &View) -> CameraMotion {
         let state = &self.filter.belief().state;
         let measured = self.last_imu.map_or_else(Vector3::zeros, |sample| sample.angular_velocity);
@@ -700,14 +731,38 @@ impl Running {
         matches.into_iter().filter_map(associate).collect()
     }
 
-    /// Indices into `matches` that agree on one pose.
-    fn find_inliers(&self, matches: &[Association], view: &View) -> Vec<usize> {
+    /// Indices into `matches` that agree on the pose of the camera, and how many agree on another:
+    /// that of something that moves.
+    ///
+    /// Most may lie on what moves. Of two motions that have nothing in common, the camera's is
+    /// the one that the IMU predicts.
+    fn find_inliers(&self, matches: &[Association], view: &View) -> (Vec<usize>, usize) {
         let correspondences: Vec<_> = matches.iter().map(|m| m.correspondence).collect();
-        let rotation = self.world_from_camera(view).rotation;
+        let predicted = self.world_from_camera(view);
         let config = &view.config.ransac;
-        estimate_pose(&correspondences, view.camera, Some(&rotation), config, view.seed)
-            .map(|agreement| agreement.inliers)
-            .unwrap_or_default()
+        let agree = |among: &[Correspondence]| {
+            estimate_pose(among, view.camera, Some(&predicted.rotation), config, view.seed)
+        };
+        let Some(mut found) = agree(&correspondences) else { return (vec![], 0) };
+        if self.last_imu.is_some()
+            && !view.lost
+            && 10 * found.inliers.len() < 9 * matches.len()
+            && let Some(expected) = agree_near(&correspondences, view.camera, &predicted, config)
+        {
+            let shared = expected.inliers.iter().filter(|i| found.inliers.binary_search(i).is_ok());
+            let apart = 2 * shared.count() < expected.inliers.len();
+            if apart && 4 * expected.inliers.len() >= found.inliers.len() {
+                found = expected;
+            }
+        }
+        // What is a little off follows the camera, only not as well as it should.
+        let near = agreeing(&correspondences, view.camera, &found.model, 3.0, config);
+        let astray: Vec<_> = (correspondences.iter().zip(membership(&near, matches.len())))
+            .filter_map(|(correspondence, near)| (!near).then_some(*correspondence))
+            .collect();
+        let suspect = astray.len() >= FEW_ASTRAY && 4 * astray.len() > matches.len();
+        let others = agree(if suspect { &astray } else { &[] });
+        (found.inliers, others.map_or(0, |others| others.inliers.len()))
     }
 
     /// Conditions belief and map on the inliers; `None` if there were none.
@@ -723,6 +778,7 @@ impl Running {
             .filter_map(|&i| matches.get(i))
             .map(|m| (m.point, point_pair(&m.correspondence, view)))
             .collect();
+        let calibration = self.filter.calibration().copied();
         let held =
             |points: &dyn PointState| pairs.iter().any(|(id, _)| points.estimate(*id).is_some());
         let outcome = match self.filter.point_state() {
@@ -730,13 +786,18 @@ impl Running {
                 let seen: Vec<_> = pairs.iter().map(|(id, pair)| seen_point(*id, pair)).collect();
                 points.measure(&seen)?
             }
-            Some(_) => return self.find_back(&pairs, view),
+            Some(_) => {
+                let outcome = self.find_back(&pairs, view)?;
+                self.follow_camera(calibration);
+                return Some(outcome);
+            }
             None => {
                 let only_pairs: Vec<_> = pairs.iter().map(|(_, pair)| *pair).collect();
                 self.filter.update(&only_pairs)?
             }
         };
-        if !self.follow_world() && treatment != MapTreatment::Fixed {
+        let moved = self.follow_world() | self.follow_camera(calibration);
+        if !moved && treatment != MapTreatment::Fixed {
             let refinement = self.filter.map_refinement();
             let passed = self.filter.passed().iter();
             for ((id, pair), _) in pairs.iter().zip(passed).filter(|(_, passed)| **passed) {
@@ -765,9 +826,20 @@ impl Running {
     fn follow_world(&mut self) -> bool {
         let turn = self.filter.take_world_turn();
         if let Some(turn) = turn {
-            self.map.turn(&turn);
+            self.map.carry(&Isometry3::from_parts(Translation3::identity(), turn));
         }
         turn.is_some()
+    }
+
+    /// Moves the map with the camera where the calibration is another than `before`: from about
+    /// here its points were placed by it, and those of the state have moved so. True if it was
+    /// moved by more than what points are measured to.
+    fn follow_camera(&mut self, before: Option<Calibration>) -> bool {
+        let Some((before, now)) = before.zip(self.filter.calibration()) else { return false };
+        let in_body = now.body_from_camera * before.body_from_camera.inverse();
+        let world_from_body = self.filter.belief().state.world_from_body;
+        self.map.carry(&(world_from_body * in_body * world_from_body.inverse()));
+        in_body.rotation.angle() > 1e-4 || in_body.translation.vector.norm() > 1e-4
     }
 
     /// Conditions the belief on rest if the body is at rest; a note where that begins or ends.

@@ -17,6 +17,8 @@ const LEARNING: u32 = 20;
 const NOISE_BURST: f64 = 4.0;
 /// For so long after a burst was noticed samples count as noisy, s.
 const NOISE_MEMORY: f64 = 0.15;
+/// For so long after IMU and images contradicted each other samples count as noisy, s.
+const DISTRUST: f64 = 0.3;
 /// Samples over which noise is averaged.
 const NOISE_SAMPLES: usize = 12;
 /// Parts of the image, across and down, in which features are counted.
@@ -31,9 +33,11 @@ const MAX_FORCE: f64 = 150.0;
 /// The mean specific force is compared with gravity over about this time, s, and within this factor.
 const FORCE_TIME: f64 = 0.3;
 const FORCE_FACTOR: f64 = 1.6;
-/// With less than this share of the matches agreeing, when there are this many, something moves.
-const AGREEING: f64 = 0.5;
-const MANY_MATCHES: usize = 30;
+/// With at least so many matches, and this share of those that disagree with the camera's pose,
+/// agreeing on another one in so many frames in a row, something moves.
+const MANY_ASTRAY: usize = 30;
+const SHARE_ASTRAY: f64 = 0.4;
+const FRAMES_ASTRAY: u32 = 2;
 
 /// Speaks once when a condition is first met, and again only after it was absent for a while.
 #[derive(Debug, Clone, Default)]
@@ -155,6 +159,7 @@ pub(super) struct SensorWatch {
     usual_parts: Usual,
     obstruction: Alarm,
     moving: Alarm,
+    frames_astray: u32,
     contradiction: Alarm,
     bias: Alarm,
 }
@@ -164,7 +169,9 @@ pub(super) struct SensorWatch {
 pub(super) struct Agreement {
     pub matches: usize,
     pub inliers: usize,
-    /// Whether most inliers contradict the prediction.
+    /// Matches that agree on another pose.
+    pub others: usize,
+    /// Whether the inliers contradict the prediction.
     pub contradicted: bool,
 }
 
@@ -181,6 +188,7 @@ impl SensorWatch {
             usual_parts: Usual::default(),
             obstruction: Alarm::default(),
             moving: Alarm::default(),
+            frames_astray: 0,
             contradiction: Alarm::default(),
             bias: Alarm::default(),
         }
@@ -199,11 +207,18 @@ impl SensorWatch {
         stamps.into_iter().chain(gyroscope).chain(accelerometer).chain(implausible)
     }
 
-    /// Whether the IMU was unusually noisy shortly before.
+    /// Whether the IMU was unusually noisy, implausible or contradicted shortly before.
     pub fn is_noisy(&self, stamp: Stamp) -> bool {
-        let alarms = [&self.gyroscope.alarm, &self.accelerometer.alarm];
-        let recent = |last: Stamp| stamp.seconds_since(last) < NOISE_MEMORY;
-        alarms.into_iter().filter_map(|alarm| alarm.last).any(recent)
+        let alarms = [
+            (&self.gyroscope.alarm, NOISE_MEMORY),
+            (&self.accelerometer.alarm, NOISE_MEMORY),
+            (&self.units, NOISE_MEMORY),
+            (&self.contradiction, DISTRUST),
+        ];
+        let recent = |(alarm, memory): (&Alarm, f64)| {
+            alarm.last.is_some_and(|last| stamp.seconds_since(last) < memory)
+        };
+        alarms.into_iter().any(recent)
     }
 
     /// Tells of readings that are none of a body on earth.
@@ -259,16 +274,20 @@ impl SensorWatch {
         seen: Agreement,
         state: &NavState,
     ) -> impl Iterator<Item = Note> {
-        let Agreement { matches, inliers, contradicted } = seen;
-        let few = matches >= MANY_MATCHES && (inliers as f64) < AGREEING * matches as f64;
-        let moving = self.moving.tell(stamp, few, || {
+        let Agreement { matches, inliers, others, contradicted } = seen;
+        let astray = matches.saturating_sub(inliers) as f64;
+        let moves = others >= MANY_ASTRAY && others as f64 >= SHARE_ASTRAY * astray;
+        self.frames_astray = if moves { self.frames_astray + 1 } else { 0 };
+        let moving = self.moving.tell(stamp, self.frames_astray >= FRAMES_ASTRAY, || {
             format!(
-                "matches disagree at {stamp} s: {inliers} of {matches} agree on one pose; something \
-                 moves, or the image is blurred"
+                "something moves at {stamp} s: of {matches} matches {inliers} agree on the camera's \
+                 pose and {others} on another"
             )
         });
         let contradiction = self.contradiction.tell(stamp, contradicted, || {
-            format!("most points contradict the prediction at {stamp} s: the gate is opened")
+            format!(
+                "IMU and images contradict each other at {stamp} s: the prediction is distrusted"
+            )
         });
         let beyond = |bias: f64, sd: f64| sd > 0.0 && bias > UNUSUAL_BIAS * sd;
         let (gyro, accel) = (state.gyro_bias.amax(), state.accel_bias.amax());
@@ -354,17 +373,19 @@ mod tests {
             accel_bias: Vector3::zeros(),
         };
         let mut told = |inliers, contradicted, state: &NavState| -> Vec<String> {
-            let seen = Agreement { matches: 100, inliers, contradicted };
+            let others = if inliers < 80 { 40 } else { 10 };
+            let seen = Agreement { matches: 100, inliers, others, contradicted };
             watch.agreement(at(0.0), seen, state).map(|note| note.text).collect()
         };
         assert!(told(90, false, &state).is_empty());
-        assert!(told(40, false, &state)[0].contains("40 of 100 agree"));
+        assert!(told(40, false, &state).is_empty());
+        assert!(told(40, false, &state)[0].contains("40 on another"));
         assert!(told(40, true, &state)[0].contains("contradict"));
         state.gyro_bias.z = -6.0 * ImuConfig::default().gyro_bias_sd;
         assert!(told(90, false, &state)[0].contains("unusual bias"));
 
         let mut without_imu = SensorWatch::new(&ImuConfig::default());
-        let seen = Agreement { matches: 100, inliers: 90, contradicted: false };
+        let seen = Agreement { matches: 100, inliers: 90, others: 0, contradicted: false };
         assert_eq!(without_imu.agreement(at(0.0), seen, &state).count(), 0);
     }
 }

@@ -50,6 +50,8 @@ pub struct FaultOutcome {
     pub fault: Option<String>,
     /// Why the run ended with an error, if it did.
     pub failure: Option<String>,
+    /// Length of the log by its stamps, s.
+    pub seconds: f64,
     pub frames: u64,
     /// Whether every pose and covariance is finite and stamps increase.
     pub valid: bool,
@@ -91,6 +93,7 @@ impl FaultOutcome {
         Self {
             fault: fault.map(Fault::to_string),
             failure: None,
+            seconds: replayed.metrics.log_seconds,
             frames: replayed.metrics.odometry.frames_processed,
             valid: replayed.is_valid(),
             named: fault.and_then(|fault| {
@@ -108,6 +111,7 @@ impl FaultOutcome {
         Self {
             fault: fault.map(Fault::to_string),
             failure: Some(failure),
+            seconds: 0.0,
             frames: 0,
             valid: false,
             named: None,

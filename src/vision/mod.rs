@@ -26,5 +26,5 @@ pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_g
 #[cfg(feature = "vision")]
 pub use orb::{OrbExtractor, VisionError};
 pub use patch::{Patch, PatchConfig};
-pub use ransac::{Correspondence, RansacConfig, estimate_pose};
+pub use ransac::{Correspondence, RansacConfig, agree_near, agreeing, estimate_pose};
 pub use stereo::{StereoError, StereoRig, rectified_camera};

@@ -332,6 +332,36 @@ pub fn estimate_pose(
     }
 }
 
+/// Indices of the correspondences within `factor` times the tolerance of a pose.
+pub fn agreeing(
+    correspondences: &[Correspondence],
+    camera: &PinholeCamera,
+    world_from_camera: &Isometry3<f64>,
+    factor: f64,
+    config: &RansacConfig,
+) -> Vec<usize> {
+    let consensus = Reprojection {
+        camera: *camera,
+        max_pixel_sigmas: factor * config.max_pixel_sigmas,
+        max_depth_sigmas: factor * config.max_depth_sigmas,
+    };
+    Scored::new(*world_from_camera, correspondences, &consensus).inliers
+}
+
+/// The pose near a predicted one that most correspondences agree on, and they: it is that of those
+/// within twice the tolerance of the prediction. `None` if they do not determine one.
+pub fn agree_near(
+    correspondences: &[Correspondence],
+    camera: &PinholeCamera,
+    world_from_camera: &Isometry3<f64>,
+    config: &RansacConfig,
+) -> Option<Agreement<Isometry3<f64>>> {
+    let near = agreeing(correspondences, camera, world_from_camera, 2.0, config);
+    let model = FullPose.estimate(correspondences, &near)?;
+    let inliers = agreeing(correspondences, camera, &model, 1.0, config);
+    (inliers.len() >= config.min_inliers).then_some(Agreement { model, inliers, iterations: 1 })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

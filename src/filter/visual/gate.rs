@@ -11,8 +11,9 @@ const DEGREES_OF_FREEDOM: f64 = 3.0;
 
 /// Leaves out points whose innovation is improbable.
 ///
-/// If most points fail, it is the prediction that is wrong and not they: then all pass, to be
-/// weighed by the robust kernel alone.
+/// If all but a quarter of the points fail, it is the prediction that is wrong and not they: then
+/// all pass, to be weighed by the robust kernel alone. (Half of them may lie on something that
+/// moves.)
 #[derive(Debug, Clone)]
 pub struct Gate {
     /// Squared Mahalanobis distance.
@@ -81,7 +82,7 @@ impl Gate {
             self.passed.push(distance <= self.threshold);
         }
         let rejected = self.passed.iter().filter(|passed| !**passed).count();
-        if 2 * rejected > self.passed.len() {
+        if 4 * rejected > 3 * self.passed.len() {
             self.passed.fill(true);
             return Screening { largest, threshold: f64::INFINITY, rejected: 0 };
         }
@@ -163,9 +164,9 @@ mod tests {
     #[test]
     fn a_wrong_prediction_opens_the_gate() {
         let mut gate = Gate::new(&FilterConfig::default());
-        let pairs = [pair(3.0), pair(2.0), pair(0.0)];
+        let pairs = [pair(3.0), pair(2.0), pair(2.5), pair(2.0), pair(0.0)];
         let found = screen(&mut gate, &pairs);
-        assert_eq!((found.rejected, gate.accepted(&pairs).count()), (0, 3));
+        assert_eq!((found.rejected, gate.accepted(&pairs).count()), (0, 5));
         assert_eq!(found.threshold, f64::INFINITY);
         let mut none =
             Gate::new(&FilterConfig { gate_probability: 0.0, ..FilterConfig::default() });

@@ -299,6 +299,16 @@ pub struct UpdateOutcome {
     pub screening: Screening,
 }
 
+impl UpdateOutcome {
+    /// Whether the points contradict the prediction: so large an innovation of so many points does
+    /// not happen by chance, nor by a noise model that is somewhat too small.
+    pub fn contradicts(&self) -> bool {
+        const INNOVATION: f64 = 2.5;
+        const POINTS: usize = 8;
+        self.innovation > INNOVATION && self.points >= POINTS
+    }
+}
+
 /// What the gate found of the points before an update.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Screening {

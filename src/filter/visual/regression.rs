@@ -46,13 +46,9 @@ pub(super) enum Target {
     /// A block of the Euclidean part. Where the calibration is part of the state, too, such a
     /// block is the point as the camera sees it, mounted as estimated.
     State { block: usize },
-    /// A point known independently of the state, world coordinates (m, m^2), and the derivative
-    /// of its measurement by the blocks of the calibration.
-    Known {
-        position: Vector3<f64>,
-        covariance: Matrix3<f64>,
-        by_calibration: [Matrix3<f64>; CALIBRATION_BLOCKS],
-    },
+    /// A point known independently of the state, world coordinates (m, m^2). It was placed by
+    /// the same calibration, of which it therefore tells nothing.
+    Known { position: Vector3<f64>, covariance: Matrix3<f64> },
 }
 
 /// Density of the rotation and the Euclidean part `x` given it (W22 chapter 3, with the
@@ -143,21 +139,6 @@ impl<'a> Regression<'a> {
         self.coordinates == Coordinates::Group && !BIASES.contains(&block) && !calibrates
     }
 
-    /// The blocks of the calibration with the derivative of the residual by each, world
-    /// coordinates at the prior.
-    fn calibration_terms(
-        &self,
-        measurement: &Measurement,
-    ) -> impl Iterator<Item = (usize, Matrix3<f64>)> {
-        let turn = *self.prior.matrix();
-        let derivatives = match measurement.target {
-            Target::State { .. } => None,
-            Target::Known { by_calibration, .. } => Some(by_calibration.map(|by| turn * by)),
-        };
-        let blocks = self.calibration.zip(derivatives);
-        blocks.into_iter().flat_map(|(first, derivatives)| (first..).zip(derivatives))
-    }
-
     /// Squared Mahalanobis distance of each measurement from what is expected of it.
     pub fn squared_distances(&self, measurements: &[Measurement]) -> Option<Vec<f64>> {
         let at_prior = self.coordinates.at_prior();
@@ -239,9 +220,6 @@ impl<'a> Regression<'a> {
             }
             Target::Known { position, .. } => position,
         };
-        for (block, by_block) in self.calibration_terms(measurement) {
-            rows += by_block * self.slope.rows(3 * block, 3);
-        }
         let expected = self.prior.inverse() * (target - position);
         let last = rows.ncols() - 1;
         match self.coordinates {
@@ -272,9 +250,6 @@ impl<'a> Regression<'a> {
         if let Target::State { block } = measurement.target {
             *sum -= self.covariance.columns(3 * block, 3);
         }
-        for (block, by_block) in self.calibration_terms(measurement) {
-            sum.gemm(1.0, &self.covariance.columns(3 * block, 3), &by_block.transpose(), 1.0);
-        }
     }
 
     /// Adds the covariance of the residual of a measurement with those whose covariance with `x`
@@ -288,9 +263,6 @@ impl<'a> Regression<'a> {
         *sum += cross.rows(3 * POSITION, 3);
         if let Target::State { block } = measurement.target {
             *sum -= cross.rows(3 * block, 3);
-        }
-        for (block, by_block) in self.calibration_terms(measurement) {
-            sum.gemm(1.0, &by_block, &cross.rows(3 * block, 3), 1.0);
         }
     }
 

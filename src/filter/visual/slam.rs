@@ -62,6 +62,8 @@ pub struct SlamFilter {
     timed_by: Option<Calibration>,
     /// Angular velocity as last measured, rad/s.
     measured_rate: Vector3<f64>,
+    /// Time that the IMU has carried the belief since points last corrected it, s.
+    carried: f64,
     /// Whether the heading is that of an arbitrary world: uniform, and independent of all else.
     heading_is_free: bool,
     gate: Gate,
@@ -91,6 +93,7 @@ impl SlamFilter {
             calibration: None,
             timed_by: None,
             measured_rate: Vector3::zeros(),
+            carried: 0.0,
             heading_is_free: false,
             gate: Gate::new(config),
             passed: Vec::new(),
@@ -217,11 +220,37 @@ impl SlamFilter {
         blocks
     }
 
+    /// Conditions the belief on points. A prediction that they contradict is the IMU's fault: it
+    /// is made as uncertain as it takes. What is reported is how far off it was.
     fn condition(&mut self, measurements: &[Measurement]) -> Option<UpdateOutcome> {
         if measurements.is_empty() {
             return None;
         }
         self.synchronize();
+        let first = self.conditioned(measurements)?;
+        let (innovation, certain) = (first.outcome.innovation, self.belief.covariance);
+        let distrust = self.propagator.distrust(self.carried);
+        let mut latest = first;
+        for variance in [1.0, 16.0, 256.0] {
+            let Some(distrust) = distrust.filter(|_| latest.contradicts()) else { break };
+            self.belief.covariance = certain + distrust * variance;
+            self.synchronize();
+            let Some(widened) = self.conditioned(measurements) else { break };
+            latest = widened;
+        }
+        let Conditioned { posterior, outcome, turns_too_far } = latest;
+        if turns_too_far || self.accept(posterior).is_none() {
+            self.belief.covariance = certain;
+            self.synchronize();
+            return None;
+        }
+        self.carried = 0.0;
+        self.settle_gravity();
+        Some(UpdateOutcome { innovation, ..outcome })
+    }
+
+    /// What the belief becomes by points, the covariance being up to date.
+    fn conditioned(&mut self, measurements: &[Measurement]) -> Option<Conditioned> {
         let prior = self.belief.state.world_from_body.rotation.to_rotation_matrix();
         let means = self.euclidean();
         let calibration = self.calibration.map(|_| self.after_gravity() / 3 - 1);
@@ -251,12 +280,9 @@ impl SlamFilter {
         let innovation = first?;
         let turn = so3::log(&(prior.inverse() * posterior.mode));
         let explained = 3.0 * accepted.len() as f64 * innovation;
-        if self.turn_distance(&turn)? > MOST_TURN * explained.max(NOISE_TURN) {
-            return None;
-        }
-        self.accept(posterior)?;
-        self.settle_gravity();
-        Some(UpdateOutcome { innovation, points: accepted.len(), screening })
+        let turns_too_far = self.turn_distance(&turn)? > MOST_TURN * explained.max(NOISE_TURN);
+        let outcome = UpdateOutcome { innovation, points: accepted.len(), screening };
+        Some(Conditioned { posterior, outcome, turns_too_far })
     }
 
     /// Squared Mahalanobis distance of a turn of the body from the belief.
@@ -484,6 +510,22 @@ impl SlamFilter {
     }
 }
 
+/// What an update would make of the belief.
+struct Conditioned {
+    posterior: Posterior,
+    outcome: UpdateOutcome,
+    /// Whether it would turn the body much further than its innovations allow.
+    turns_too_far: bool,
+}
+
+impl Conditioned {
+    /// Whether it is the prediction that is wrong: a few points may be wrong themselves.
+    fn contradicts(&self) -> bool {
+        const MANY_POINTS: usize = 30;
+        self.outcome.contradicts() || self.turns_too_far && self.outcome.points >= MANY_POINTS
+    }
+}
+
 /// An attitude that moved further than this in an update has its measurements weighted anew at
 /// where it came to, rad.
 const RELINEARIZE_ABOVE: f64 = 0.02;
@@ -505,6 +547,7 @@ impl VisualInertialFilter for SlamFilter {
         if let Some(step) = step {
             self.measured_rate = to.angular_velocity;
             self.timed_by = self.calibration;
+            self.carried += to.stamp.seconds_since(from.stamp).max(0.0);
             self.transition = step * self.transition;
             if let Some(gravity) = &mut self.gravity {
                 gravity.propagate(&mut self.belief, &step, to.stamp.seconds_since(from.stamp));
@@ -526,11 +569,10 @@ impl VisualInertialFilter for SlamFilter {
             .iter()
             .map(|pair| {
                 let (position, covariance) = (pair.in_world, pair.world_covariance);
-                let by_calibration = self.by_calibration(&position).unwrap_or_default();
                 Measurement {
                     in_body: self.retimed(&pair.in_body),
                     body_covariance: pair.body_covariance,
-                    target: Target::Known { position, covariance, by_calibration },
+                    target: Target::Known { position, covariance },
                 }
             })
             .collect();
