@@ -195,11 +195,7 @@ fn trial(drives: &Drives, rng: &mut ChaCha8Rng) -> Result<Trial, MatrixFisherErr
     for case in drives.cases {
         let map = prior_map(&scene, case.prior, rng);
         let (belief, attitude) = start(&scene, case.heading, rng)?;
-        let broad = attitude.is_some();
-        let can_start = |contender: &&Contender| {
-            !(broad && contender.kind.map_treatment() == MapTreatment::Correlated)
-        };
-        for contender in drives.filters.iter().copied().flatten().filter(can_start) {
+        for contender in drives.filters.iter().copied().flatten() {
             let &Contender { kind, update_method, .. } = contender;
             let config = FilterConfig {
                 update_method,
@@ -394,7 +390,8 @@ fn see(
     }
     for sighting in &frame.sightings {
         let point = &mut map[sighting.landmark];
-        if point.is_none() {
+        // A filter that is to hold its points holds none yet, while its attitude is broad.
+        if point.is_none() && treatment != MapTreatment::Correlated {
             *point = Some(filter.insert(treatment, &sighting.in_body, &body_covariance));
         }
     }

@@ -64,6 +64,11 @@ impl MfgFilter {
         Self { config: config.clone(), propagator, belief, broad: Some(Box::new(broad)), gate }
     }
 
+    /// Whether the attitude is too uncertain for a covariance.
+    pub(super) fn is_broad(&self) -> bool {
+        self.broad.is_some()
+    }
+
     /// Changes the form of a belief that has become too uncertain for a covariance.
     fn broaden(&mut self) {
         let rotation = self.belief.covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION);

@@ -5,6 +5,7 @@ mod broad;
 mod calibration;
 mod gate;
 mod gravity;
+mod handover;
 mod mekf;
 mod mfg;
 mod regression;
@@ -25,6 +26,7 @@ use crate::so3::ProperSvd;
 
 pub use body_points::BodyPoints;
 pub use calibration::{Calibration, calibration_block};
+use handover::HandOver;
 pub use mekf::Mekf;
 pub use mfg::MfgFilter;
 pub use regression::Coordinates;
@@ -117,9 +119,8 @@ impl FilterKind {
             Self::Mfgd | Self::Mfgr => {
                 Box::new(MfgFilter::broad(config, propagator, belief, attitude))
             }
-            Self::Mekfd | Self::Mekfr | Self::Mfgs | Self::Mekfs => {
-                self.start(config, propagator, belief)
-            }
+            Self::Mfgs => Box::new(HandOver::new(config, propagator, belief, attitude)),
+            Self::Mekfd | Self::Mekfr | Self::Mekfs => self.start(config, propagator, belief),
         }
     }
 }
