@@ -1,12 +1,12 @@
 //! From a broad attitude to map points in the state.
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::UnitQuaternion;
 
 use super::{
-    Calibration, Coordinates, FilterConfig, MfgFilter, PointState, Rest, SlamFilter, UpdateOutcome,
-    VisualInertialFilter,
+    BodyPoints, Calibration, Coordinates, FilterConfig, MfgFilter, PointState, Rest, SlamFilter,
+    UpdateOutcome, VisualInertialFilter,
 };
-use crate::alignment::{MapEstimate, PointPair};
+use crate::alignment::PointPair;
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator};
 use crate::so3::ProperSvd;
@@ -102,8 +102,8 @@ impl VisualInertialFilter for HandOver {
         self.filter().matrix_fisher()
     }
 
-    fn world_point(&self, in_body: &Vector3<f64>) -> MapEstimate {
-        self.filter().world_point(in_body)
+    fn body_points(&self) -> BodyPoints {
+        self.filter().body_points()
     }
 
     fn reported_covariance(&self) -> NavCovariance {
@@ -130,9 +130,10 @@ impl VisualInertialFilter for HandOver {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::alignment::MapEstimate;
     use crate::filter::FilterKind;
     use crate::inertial::{ImuConfig, NavState, Stamp};
-    use nalgebra::{Isometry3, Matrix3, Point3};
+    use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 
     #[test]
     fn a_known_map_makes_a_broad_attitude_certain_and_is_then_held() {
