@@ -735,7 +735,7 @@ impl Running {
     /// that of something that moves.
     ///
     /// Most may lie on what moves. Of two motions that have nothing in common, the camera's is
-    /// the one that the IMU predicts.
+    /// the one that the IMU predicts, if more of the points that have long been seen follow it.
     fn find_inliers(&self, matches: &[Association], view: &View) -> (Vec<usize>, usize) {
         let correspondences: Vec<_> = matches.iter().map(|m| m.correspondence).collect();
         let predicted = self.world_from_camera(view);
@@ -751,7 +751,13 @@ impl Running {
         {
             let shared = expected.inliers.iter().filter(|i| found.inliers.binary_search(i).is_ok());
             let apart = 2 * shared.count() < expected.inliers.len();
-            if apart && 4 * expected.inliers.len() >= found.inliers.len() {
+            let proven = |inliers: &[usize]| {
+                let observations =
+                    |i: &usize| self.map.get(matches[*i].point).map(|point| point.observations);
+                let least = view.config.filter.state_min_observations;
+                inliers.iter().filter(|i| observations(i) >= Some(least)).count()
+            };
+            if apart && proven(&expected.inliers) > proven(&found.inliers) {
                 found = expected;
             }
         }
