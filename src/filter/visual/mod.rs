@@ -301,12 +301,14 @@ pub struct UpdateOutcome {
 }
 
 impl UpdateOutcome {
-    /// Whether the points contradict the prediction: so large an innovation of so many points does
-    /// not happen by chance, nor by a noise model that is somewhat too small.
+    /// Whether the points contradict the prediction: an innovation that does not happen by chance,
+    /// nor by a noise model that is somewhat too small.
     pub fn contradicts(&self) -> bool {
-        const INNOVATION: f64 = 2.5;
-        const POINTS: usize = 8;
-        self.innovation > INNOVATION && self.points >= POINTS
+        const LARGE: f64 = 2.5;
+        const DEVIATIONS: f64 = 5.0;
+        // Of the mean of the squares of so many normal numbers.
+        let deviation = (2.0 / (3.0 * self.points as f64)).sqrt();
+        self.innovation > LARGE.max(1.0 + DEVIATIONS * deviation)
     }
 }
 
