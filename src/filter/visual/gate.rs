@@ -182,11 +182,13 @@ mod tests {
             world_covariance: Matrix3::zeros(),
             ..pair(0.0)
         };
-        for pairs in [[pair(0.0), undefined, singular], [pair(9.0), pair(8.0), undefined]] {
+        let closed = vec![pair(0.0), undefined, singular];
+        let opened = vec![pair(9.0), pair(8.0), pair(7.0), pair(8.0), undefined];
+        for pairs in [closed, opened] {
             let found = screen(&mut gate, &pairs);
             assert!(found.largest.is_finite());
             let usable = |pair: &PointPair| pair.in_world.x.is_finite() && *pair != singular;
-            assert_eq!(gate.passed(), pairs.map(|pair| usable(&pair)));
+            assert_eq!(gate.passed(), pairs.iter().map(usable).collect::<Vec<_>>());
             assert!(gate.accepted(&pairs).all(usable));
         }
     }

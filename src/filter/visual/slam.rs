@@ -221,7 +221,8 @@ impl SlamFilter {
     }
 
     /// Conditions the belief on points. A prediction that they contradict is the IMU's fault: it
-    /// is made as uncertain as it takes. What is reported is how far off it was.
+    /// is made as uncertain as it takes, unless they are so few that they may be wrong themselves.
+    /// What is reported is how far off it was.
     fn condition(&mut self, measurements: &[Measurement]) -> Option<UpdateOutcome> {
         if measurements.is_empty() {
             return None;
@@ -230,16 +231,18 @@ impl SlamFilter {
         let first = self.conditioned(measurements)?;
         let (innovation, certain) = (first.outcome.innovation, self.belief.covariance);
         let distrust = self.propagator.distrust(self.carried);
+        let few = first.outcome.points < FEW_POINTS;
         let mut latest = first;
-        for variance in [1.0, 16.0, 256.0] {
+        for variance in if few { &[1.0][..] } else { &[1.0, 16.0, 256.0] } {
             let Some(distrust) = distrust.filter(|_| latest.contradicts()) else { break };
-            self.belief.covariance = certain + distrust * variance;
+            self.belief.covariance = certain + distrust * *variance;
             self.synchronize();
             let Some(widened) = self.conditioned(measurements) else { break };
             latest = widened;
         }
-        let Conditioned { posterior, outcome, turns_too_far } = latest;
-        if turns_too_far || self.accept(posterior).is_none() {
+        let astray = latest.turns_too_far || few && latest.contradicts();
+        let Conditioned { posterior, outcome, .. } = latest;
+        if astray || self.accept(posterior).is_none() {
             self.belief.covariance = certain;
             self.synchronize();
             return None;
@@ -509,6 +512,9 @@ impl SlamFilter {
         so3::proper_svd(&(up * kappa)).ok()
     }
 }
+
+/// Fewer points than this may all be mismatched.
+const FEW_POINTS: usize = 8;
 
 /// What an update would make of the belief.
 struct Conditioned {
