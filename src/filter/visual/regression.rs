@@ -120,10 +120,7 @@ impl<'a> Regression<'a> {
         }
         match coordinates {
             Coordinates::Group => {
-                let concentration = concentration(&rotation_information);
-                // The tangent coordinate grows as the information times the rotation error.
-                let error =
-                    rotation_covariance * tangent_coordinate(prior.matrix(), &concentration);
+                let error = tangent_coordinate(prior.matrix());
                 sum.slope.columns_mut(0, 9).copy_from(&(by_rotation * error));
             }
             Coordinates::Additive => sum.slope.columns_mut(0, 3).copy_from(&by_rotation),
@@ -398,10 +395,14 @@ fn concentration(information: &Matrix3<f64>) -> Matrix3<f64> {
     Matrix3::identity() * (0.5 * information.trace()) - information
 }
 
-/// The 3x9 matrix `L` with `L vec(R) = (K M^T R - R^T M K)^vee`: the `v_R` of MFGB (W22 3.2) in
-/// body coordinates. It is zero at the mode `M` and grows there as `(tr(K) I - K) e`.
-fn tangent_coordinate(mode: &Matrix3<f64>, concentration: &Matrix3<f64>) -> SMatrix<f64, 3, 9> {
-    let left = concentration * mode.transpose();
+/// The 3x9 matrix `L` with `L vec(R) = (M^T R - R^T M)^vee / 2`, the sine of the turn from the mode
+/// `M` along its axis, body coordinates: the turn itself but for terms of third order.
+///
+/// `v_R` (W22 3.2) is as linear in `R`, but where the axes are known unequally well it has terms of
+/// second order, `(k_i - k_j) e_i e_j`: through the slope of precisely measured points they bend
+/// the density until its curvature says nothing of its width.
+fn tangent_coordinate(mode: &Matrix3<f64>) -> SMatrix<f64, 3, 9> {
+    let left = mode.transpose() * 0.5;
     let mut l = SMatrix::zeros();
     for (component, (i, j)) in [(2, 1), (0, 2), (1, 0)].into_iter().enumerate() {
         for k in 0..3 {

@@ -351,8 +351,7 @@ impl SlamFilter {
             return false;
         }
         let n = self.covariance.ncols();
-        let mut covariance = DMatrix::zeros(n + 3, n + 3);
-        covariance.view_mut((0, 0), (n, n)).copy_from(&self.covariance);
+        let mut covariance = std::mem::take(&mut self.covariance).resize(n + 3, n + 3, 0.0);
         covariance.view_mut((n, 0), (3, n)).copy_from(rows);
         covariance.view_mut((0, n), (n, 3)).copy_from(&rows.transpose());
         covariance.view_mut((n, n), (3, 3)).copy_from(&((own + own.transpose()) * 0.5));
@@ -739,7 +738,7 @@ mod tests {
     use crate::filter::FilterKind;
     use crate::inertial::{ImuConfig, NavState, Stamp};
     use approx::assert_relative_eq;
-    use nalgebra::Isometry3;
+    use nalgebra::{Isometry3, SVector};
     use proptest::prelude::*;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
@@ -944,6 +943,78 @@ mod tests {
                 let expected = posterior.fixed_view::<3, 3>(15 + 3 * i, 15 + 3 * i);
                 assert!((point.covariance - expected).norm() < 1e-3 * expected.norm());
             }
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(16))]
+
+        /// A start from motion: tilt and velocity are known badly, heading well, points to
+        /// millimetres, and the first frames are what the belief allows for.
+        #[test]
+        fn precise_points_never_make_the_attitude_less_certain(seed: u64) {
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let axes = UnitQuaternion::new(vector(&mut rng, 1.5)).to_rotation_matrix();
+            let by_block = [[0.1, 0.1, 0.01], [1.0; 3], [1e-3; 3], [0.01; 3], [0.1; 3]];
+            let deviations = SVector::<f64, NAVIGATION>::from_iterator(by_block.concat());
+            let mut covariance =
+                NavCovariance::from_diagonal(&deviations.component_mul(&deviations));
+            let rotation = covariance.fixed_view::<3, 3>(0, 0).into_owned();
+            let in_body = axes.matrix().transpose() * rotation * axes.matrix();
+            covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&in_body);
+            let state = NavState {
+                world_from_body: Isometry3::from_parts(Vector3::zeros().into(), axes.into()),
+                velocity: Vector3::zeros(),
+                gyro_bias: Vector3::zeros(),
+                accel_bias: Vector3::zeros(),
+            };
+            let mut error = deviations.map(|sd| {
+                let drawn: f64 = StandardNormal.sample(&mut rng);
+                sd * drawn
+            });
+            let turned = axes.matrix().transpose() * error.fixed_rows::<3>(0);
+            error.fixed_rows_mut::<3>(0).copy_from(&turned);
+            let mut truth = state.corrected_by(&error);
+
+            let spread = |b: &Belief| b.covariance.fixed_view::<3, 3>(0, 0).trace();
+            let mut mfgs = filter(FilterKind::Mfgs, Belief { state, covariance });
+            let noise_sd = 0.003;
+            let landmarks: Vec<_> = (0..90)
+                .map(|_| truth.world_from_body * Point3::from(vector(&mut rng, 2.0)))
+                .collect();
+            let mut see = |truth: &NavState| -> Vec<SeenPoint> {
+                let noise = Matrix3::identity() * (noise_sd * noise_sd);
+                let exact = |l: &Point3<f64>| truth.world_from_body.inverse_transform_point(l);
+                let see = |(id, l)| {
+                    seen(id as u64, exact(l).coords + normal(&mut rng) * noise_sd, noise)
+                };
+                landmarks.iter().enumerate().map(see).collect()
+            };
+            for point in see(&truth) {
+                mfgs.point_state().unwrap().admit(&point);
+            }
+            let gravity = Vector3::z() * ImuConfig::default().gravity;
+            let sample = |truth: &NavState, nanos| ImuSample {
+                stamp: Stamp::from_nanos(nanos),
+                angular_velocity: truth.gyro_bias,
+                specific_force: truth.accel_bias
+                    + truth.world_from_body.rotation.inverse() * gravity,
+            };
+            for frame in 0..6 {
+                let (from, to) = (frame * 33_000_000, (frame + 1) * 33_000_000);
+                assert!(mfgs.propagate(&sample(&truth, from), &sample(&truth, to)));
+                truth.world_from_body.translation.vector += truth.velocity * 0.033;
+                let before = spread(mfgs.belief());
+                assert!(mfgs.point_state().unwrap().measure(&see(&truth)).is_some());
+                let after = spread(mfgs.belief());
+                prop_assert!(after < 1.02 * before, "frame {frame}: {before} became {after}");
+            }
+            let error = mfgs.belief().state.world_from_body.rotation.inverse()
+                * truth.world_from_body.rotation;
+            let covariance = mfgs.belief().covariance.fixed_view::<3, 3>(0, 0).into_owned();
+            let error = error.scaled_axis();
+            let nees = error.dot(&covariance.cholesky().unwrap().solve(&error));
+            prop_assert!(nees < 21.1, "{nees} (99.99 %)");
         }
     }
 
