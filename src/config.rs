@@ -130,6 +130,7 @@ impl Config {
         OdometryConfig {
             imu: self.imu.clone(),
             camera: self.camera.clone(),
+            depth: self.depth.clone(),
             search: self.search.clone(),
             matching: self.matching.clone(),
             patch: self.patch.clone(),

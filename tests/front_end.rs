@@ -202,7 +202,7 @@ fn run(sequence: &Sequence, config: &FeatureConfig) -> Summary {
     let mut previous: Option<(Vec<Feature>, Isometry3<f64>)> = None;
     for (index, Truth { frame, world_from_camera }) in sequence.frames.iter().enumerate() {
         let start = Instant::now();
-        let now = extractor.extract(frame).unwrap();
+        let now = extractor.extract(frame).unwrap().features;
         s.extraction_ms.push(start.elapsed().as_secs_f64() * 1e3);
         s.features.push(now.len() as f64);
         s.with_depth.push(now.iter().filter(|f| f.depth.is_some()).count() as f64);

@@ -1,5 +1,6 @@
 //! The pipeline that joins front end, map and filter.
 
+mod association;
 mod event;
 mod health;
 mod init;
@@ -17,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use crate::filter::FilterConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
-use crate::vision::{CameraConfig, MatchingConfig, PatchConfig, RansacConfig};
+use crate::vision::{CameraConfig, DepthConfig, MatchingConfig, PatchConfig, RansacConfig};
 
 pub use event::{Event, TruthPose};
 pub use health::{DivergencePolicy, HealthConfig, HealthSummary};
@@ -43,11 +44,20 @@ pub struct SearchConfig {
     pub min_matches: usize,
     /// Use matched features without depth too: they measure a direction.
     pub without_depth: bool,
+    /// Look for points of the filter's state at their predicted places too, where no corner was
+    /// detected or none was recognised.
+    pub seek_state_points: bool,
 }
 
 impl Default for SearchConfig {
     fn default() -> Self {
-        Self { min_radius: 8.0, max_radius: 120.0, min_matches: 30, without_depth: false }
+        Self {
+            min_radius: 8.0,
+            max_radius: 120.0,
+            min_matches: 30,
+            without_depth: false,
+            seek_state_points: true,
+        }
     }
 }
 
@@ -56,6 +66,7 @@ impl Default for SearchConfig {
 pub struct OdometryConfig {
     pub imu: ImuConfig,
     pub camera: CameraConfig,
+    pub depth: DepthConfig,
     pub search: SearchConfig,
     pub matching: MatchingConfig,
     pub patch: PatchConfig,

@@ -1,10 +1,11 @@
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 use std::time::Instant;
 
-use nalgebra::{
-    Isometry3, Matrix2, Matrix3, Point2, Point3, Translation3, UnitQuaternion, Vector2, Vector3,
-};
+use nalgebra::{Isometry3, Matrix3, Point2, Point3, Translation3, UnitQuaternion, Vector3};
 
+use super::association::{
+    Association, View, first_reference, in_body, place, point_pair, reference, seek, seen_point,
+};
 use super::health::{Divergence, Health, HealthSummary, Sight};
 use super::init::{Attempt, Evidence, Initializer};
 use super::report::{
@@ -21,19 +22,19 @@ use crate::filter::{
     VisualInertialFilter, point_by_pose,
 };
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, Stamp};
-use crate::map::{Map, MapPoint, ReferenceView, Sighting};
+use crate::map::{Map, MapPoint, Sighting};
 use crate::so3::ProperSvd;
 use crate::vision::{
-    Correspondence, DepthReading, Feature, Match, PinholeCamera, PointMeasurement, Prediction,
-    RgbdFrame, agree_near, agreeing, estimate_pose, match_guided,
+    Correspondence, Extraction, Feature, Match, PinholeCamera, Prediction, RgbdFrame, agree_near,
+    agreeing, estimate_pose, match_guided, ransac,
 };
 
-/// A frame whose features have been found.
+/// A frame after the front end.
 #[derive(Debug)]
 pub struct FrontEndFrame {
     pub frame: Box<RgbdFrame>,
-    pub features: Vec<Feature>,
-    /// Wall time that finding them took, s.
+    pub extraction: Extraction,
+    /// Wall time that it took, s.
     pub seconds: f64,
 }
 
@@ -262,8 +263,8 @@ impl Odometry {
         if self.has_imu && !imu_reached && !self.ended && !late {
             return None;
         }
-        let (number, front) = self.frames.pop_front()?;
-        let report = self.process(number, &front, stamp)?;
+        let (number, mut front) = self.frames.pop_front()?;
+        let report = self.process(number, &mut front, stamp)?;
         if let Some(divergence) = self.health.restarts() {
             self.leave_off(divergence, stamp);
         }
@@ -401,7 +402,12 @@ impl Odometry {
         }
     }
 
-    fn process(&mut self, number: u64, front: &FrontEndFrame, stamp: Stamp) -> Option<StepReport> {
+    fn process(
+        &mut self,
+        number: u64,
+        front: &mut FrontEndFrame,
+        stamp: Stamp,
+    ) -> Option<StepReport> {
         let body_from_camera = self.body_from_camera();
         let running = self.running.as_mut()?;
         let mut notes = std::mem::take(&mut self.notes);
@@ -424,13 +430,22 @@ impl Odometry {
         );
         times.propagation = clock.lap();
 
-        let features = &front.features;
+        let features = &front.extraction.features;
+        let detected = features.len();
+        let with_depth = features.iter().filter(|feature| feature.depth.is_some()).count();
         notes.extend(self.watch.frame(stamp, features, view.size));
-        let (candidates, matches) = running.find_matches(features, &view);
+        let (candidates, mut matches) = running.find_matches(features, &view);
         times.matching = clock.lap();
 
-        let (inliers, others) = running.find_inliers(&matches, &view);
+        let (agreement, others) = running.find_pose(&matches, &view);
+        let pose = agreement.as_ref().map(|agreement| agreement.model);
+        let mut inliers = agreement.map(|agreement| agreement.inliers).unwrap_or_default();
         times.ransac = clock.lap();
+
+        if let Some(pose) = pose.filter(|_| view.config.search.seek_state_points) {
+            running.seek_state_points(&pose, front, &mut matches, &mut inliers, &view);
+        }
+        let features = &front.extraction.features;
 
         let treatment = self.kind.map_treatment();
         let updated = running.update(&matches, &inliers, treatment, &view);
@@ -438,12 +453,11 @@ impl Odometry {
             self.stats.frames_without_update += 1;
         }
         notes.extend(running.tell_vertical(stamp));
-        let visible = features.iter().filter(|feature| feature.depth.is_some()).count();
-        let visible = visible >= view.config.search.min_matches;
+        let visible = with_depth >= view.config.search.min_matches;
         let sight = Sight {
             expected: std::mem::replace(&mut running.expects_matches, true),
             visible,
-            features: features.len(),
+            features: detected,
             matches: matches.len(),
             inliers: inliers.len(),
             updated: updated.is_some(),
@@ -493,8 +507,8 @@ impl Odometry {
             innovation,
             screening: updated.map(|outcome| outcome.screening),
             counts: StepCounts {
-                features: front.features.len(),
-                with_depth: features.iter().filter(|f| f.depth.is_some()).count(),
+                features: detected,
+                with_depth,
                 candidates,
                 matches: matches.len(),
                 inliers: inliers.len(),
@@ -502,35 +516,11 @@ impl Odometry {
                 map_points: running.map.len(),
             },
             times,
-            keypoints: keypoint_views(&front.features, &fates),
+            keypoints: keypoint_views(features, &fates),
             map: wants_map.then(|| map_views(&running.map, running.seeing_frames)),
             notes,
         })
     }
-}
-
-/// What the stages of a frame need to know besides the belief and the map.
-struct View<'a> {
-    config: &'a OdometryConfig,
-    camera: &'a PinholeCamera,
-    body_from_camera: &'a Isometry3<f64>,
-    size: (usize, usize),
-    seed: u64,
-    /// Whether vision was lost before this frame.
-    lost: bool,
-}
-
-/// A feature and the map point that it looks like.
-#[derive(Debug, Clone, Copy)]
-struct Association {
-    /// Index into the features of the frame.
-    feature: usize,
-    /// Id in the map.
-    point: u64,
-    predicted: Point2<f64>,
-    correspondence: Correspondence,
-    /// Whether the present view should serve as the reference of later ones.
-    renews_reference: bool,
 }
 
 /// What became of a feature.
@@ -645,19 +635,6 @@ impl Running {
         reported.attitude().map(|attitude| *attitude.svd())
     }
 
-    fn camera_motion(&self, view: &View) -> CameraMotion {
-        let state = &self.filter.belief().state;
-        let measured = self.last_imu.map_or_else(Vector3::zeros, |sample| sample.angular_velocity);
-        let turning = measured - state.gyro_bias;
-        let moving = state.world_from_body.rotation.inverse() * state.velocity;
-        let at_camera = moving + turning.cross(&view.body_from_camera.translation.vector);
-        let camera_from_body = view.body_from_camera.rotation.inverse();
-        CameraMotion {
-            angular_velocity: camera_from_body * turning,
-            velocity: camera_from_body * at_camera,
-        }
-    }
-
     /// Number of map points that should be visible, and the features that look like one.
     fn find_matches(&mut self, features: &[Feature], view: &View) -> (usize, Vec<Association>) {
         let world_from_camera = self.world_from_camera(view);
@@ -687,7 +664,6 @@ impl Running {
         radius: Option<f64>,
     ) -> Vec<Association> {
         let world_from_camera = self.world_from_camera(view);
-        let motion = self.camera_motion(view);
         let search = &view.config.search;
         let pose_covariance = self.filter.pose_covariance();
         let rotation = self.filter.belief().state.world_from_body.rotation;
@@ -700,8 +676,7 @@ impl Running {
             let in_body = (view.body_from_camera * Point3::from(in_camera)).coords;
             let by_pose = point_by_pose(rotation.to_rotation_matrix().matrix(), &in_body);
             let spread = by_pose * pose_covariance * by_pose.transpose() + point.covariance;
-            let sigma =
-                view.camera.fx * spread.symmetric_eigenvalues().max().max(0.0).sqrt() / in_camera.z;
+            let sigma = view.camera.fx * spread.trace().max(0.0).sqrt() / in_camera.z;
             let likely = (search.min_radius + 3.0 * sigma).min(search.max_radius);
             let radius = radius.unwrap_or(likely);
             Some(Prediction { descriptor: point.descriptor, pixel, radius })
@@ -714,7 +689,7 @@ impl Running {
         let associate = |m: Match| {
             let (point, prediction) = (points.get(m.query)?, predictions.get(m.query)?);
             let feature = features.get(m.train)?;
-            let placed = place(feature, point, &world_from_camera, &motion, view)?;
+            let placed = place(feature, point, &world_from_camera, view)?;
             Some(Association {
                 feature: m.train,
                 point: point.id,
@@ -731,19 +706,23 @@ impl Running {
         matches.into_iter().filter_map(associate).collect()
     }
 
-    /// Indices into `matches` that agree on the pose of the camera, and how many agree on another:
-    /// that of something that moves.
+    /// The pose of the camera and the indices into `matches` that agree on it, and how many agree on
+    /// another: that of something that moves.
     ///
     /// Most may lie on what moves. Of two motions that have nothing in common, the camera's is
     /// the one that the IMU predicts, if more of the points that have long been seen follow it.
-    fn find_inliers(&self, matches: &[Association], view: &View) -> (Vec<usize>, usize) {
+    fn find_pose(
+        &self,
+        matches: &[Association],
+        view: &View,
+    ) -> (Option<ransac::Agreement<Isometry3<f64>>>, usize) {
         let correspondences: Vec<_> = matches.iter().map(|m| m.correspondence).collect();
         let predicted = self.world_from_camera(view);
         let config = &view.config.ransac;
         let agree = |among: &[Correspondence]| {
             estimate_pose(among, view.camera, Some(&predicted.rotation), config, view.seed)
         };
-        let Some(mut found) = agree(&correspondences) else { return (vec![], 0) };
+        let Some(mut found) = agree(&correspondences) else { return (None, 0) };
         if self.last_imu.is_some()
             && !view.lost
             && 10 * found.inliers.len() < 9 * matches.len()
@@ -768,7 +747,32 @@ impl Running {
             .collect();
         let suspect = astray.len() >= FEW_ASTRAY && 4 * astray.len() > matches.len();
         let others = agree(if suspect { &astray } else { &[] });
-        (found.inliers, others.map_or(0, |others| others.inliers.len()))
+        (Some(found), others.map_or(0, |others| others.inliers.len()))
+    }
+
+    /// Looks for the points of the filter's state that `inliers` lack where `world_from_camera`
+    /// has them; adds what is found to the features of the frame, to `matches` and to `inliers`.
+    fn seek_state_points(
+        &self,
+        world_from_camera: &Isometry3<f64>,
+        front: &mut FrontEndFrame,
+        matches: &mut Vec<Association>,
+        inliers: &mut Vec<usize>,
+        view: &View,
+    ) {
+        let (width, height) = view.size;
+        let found: HashSet<_> =
+            inliers.iter().filter_map(|&i| matches.get(i)).map(|m| m.point).collect();
+        for id in self.map.candidates(world_from_camera, view.camera, width, height) {
+            let Some(point) = self.map.get(id).filter(|p| p.held && !found.contains(&p.id)) else {
+                continue;
+            };
+            if let Some((feature, m)) = seek(point, world_from_camera, front, view) {
+                front.extraction.features.push(feature);
+                inliers.push(matches.len());
+                matches.push(m);
+            }
+        }
     }
 
     /// Conditions belief and map on the inliers; `None` if there were none.
@@ -873,7 +877,7 @@ impl Running {
     /// many frames as the configuration allows, though there was enough to see; true if so.
     fn gives_up_map(&mut self, visible: bool, updated: bool, view: &View) -> bool {
         self.blind_frames = if updated { 0 } else { self.blind_frames + u64::from(visible) };
-        let patience = view.config.filter.state_max_unseen_frames;
+        let patience = view.config.map.max_unseen_frames;
         let Some(points) = self.filter.point_state().filter(|_| self.blind_frames > patience)
         else {
             return false;
@@ -947,134 +951,6 @@ impl Running {
         }
         self.map.prune(number);
         fates
-    }
-}
-
-/// Motion of the camera in its own coordinates, rad/s and m/s.
-struct CameraMotion {
-    angular_velocity: Vector3<f64>,
-    velocity: Vector3<f64>,
-}
-
-impl CameraMotion {
-    /// How fast a point at rest (camera coordinates, m) moves in the image, pixels/s.
-    fn image_speed(&self, point: &Vector3<f64>, camera: &PinholeCamera) -> f64 {
-        /// Short enough that the point moves by less than a pixel or so, s.
-        const STEP: f64 = 1e-3;
-        let velocity = -(self.angular_velocity.cross(point) + self.velocity);
-        let pixel = |seconds: f64| camera.project(&(point + velocity * seconds));
-        pixel(0.0).zip(pixel(STEP)).map_or(0.0, |(now, then)| (then - now).norm() / STEP)
-    }
-}
-
-/// A matched feature as a measurement of its map point.
-struct Placed {
-    measurement: PointMeasurement,
-    renews_reference: bool,
-}
-
-/// Aligns `feature` with the reference view of `point`, where there is one, and measures it there.
-///
-/// Without depth the feature measures a direction: a point at the predicted depth, as uncertain
-/// along the ray as it is far. `None` where such features are not wanted.
-fn place(
-    feature: &Feature,
-    point: &MapPoint,
-    world_from_camera: &Isometry3<f64>,
-    motion: &CameraMotion,
-    view: &View,
-) -> Option<Placed> {
-    let predicted = world_from_camera.inverse_transform_point(&Point3::from(point.position)).z;
-    let direction_only =
-        DepthReading { depth: predicted, slope: Vector2::zeros(), standard_deviation: predicted };
-    let depth = match feature.depth {
-        Some(depth) => depth,
-        None if view.config.search.without_depth && predicted > 0.0 => direction_only,
-        None => return None,
-    };
-    let config = &view.config.patch;
-    let (mut shift, mut sigma) = (Vector2::zeros(), feature.pixel_sigma);
-    let mut renews_reference = true;
-    if let (true, Some(reference), Some(patch)) = (config.align, &point.reference, &feature.patch)
-        && let Some(warp) = warp(reference, feature, &depth, world_from_camera, view.camera)
-        && let Some(found) =
-            patch.align(&reference.patch, reference.offset, &warp, config.max_shift)
-        && found.correlation >= config.min_correlation
-    {
-        shift = found.shift * feature.scale;
-        let speed =
-            motion.image_speed(&view.camera.unproject(feature.pixel, depth.depth), view.camera);
-        sigma = (config.pixel_sigma * feature.scale).hypot(config.motion_sigma * speed);
-        let change = warp.determinant().abs().sqrt();
-        renews_reference = change.max(change.recip()) > config.max_scale_change;
-    }
-    let measurement = feature.measurement_with(&depth, view.camera, shift, sigma);
-    Some(Placed { measurement, renews_reference })
-}
-
-/// Maps offsets from the feature to offsets from where the reference view saw the same surface,
-/// both in pixels of their pyramid levels, to first order.
-fn warp(
-    reference: &ReferenceView,
-    feature: &Feature,
-    depth: &DepthReading,
-    world_from_camera: &Isometry3<f64>,
-    camera: &PinholeCamera,
-) -> Option<Matrix2<f64>> {
-    /// Of the order of the window that is compared, pixels of the level.
-    const STEP: f64 = 4.0;
-    let reference_from_camera = reference.world_from_camera.inv_mul(world_from_camera);
-    let seen = |offset: Vector2<f64>| {
-        let at = camera.unproject(feature.pixel + offset, depth.depth + depth.slope.dot(&offset));
-        camera.project(&(reference_from_camera * Point3::from(at)).coords)
-    };
-    let column = |axis: Vector2<f64>| {
-        let step = axis * (STEP * feature.scale);
-        Some((seen(step)? - seen(-step)?) / (2.0 * STEP * reference.scale))
-    };
-    Some(Matrix2::from_columns(&[column(Vector2::x())?, column(Vector2::y())?]))
-}
-
-/// The view of a feature that becomes a map point.
-fn first_reference(feature: &Feature, world_from_camera: &Isometry3<f64>) -> Option<ReferenceView> {
-    let patch = feature.patch.clone()?;
-    let (offset, scale) = (Vector2::zeros(), feature.scale);
-    Some(ReferenceView { patch, offset, scale, world_from_camera: *world_from_camera })
-}
-
-/// The present view of `point`, which is where the belief has it by now.
-fn reference(
-    feature: &Feature,
-    point: &MapPoint,
-    world_from_camera: &Isometry3<f64>,
-    view: &View,
-) -> Option<ReferenceView> {
-    let in_camera = world_from_camera.inverse_transform_point(&Point3::from(point.position));
-    let offset = (view.camera.project(&in_camera.coords)? - feature.pixel) / feature.scale;
-    let near = offset.norm() <= view.config.patch.max_shift;
-    let first = first_reference(feature, world_from_camera).filter(|_| near)?;
-    Some(ReferenceView { offset, ..first })
-}
-
-/// A camera measurement in body coordinates, its covariance inflated as configured.
-fn in_body(measurement: &PointMeasurement, view: &View) -> (Vector3<f64>, Matrix3<f64>) {
-    let rotation = view.body_from_camera.rotation.to_rotation_matrix();
-    let covariance = rotation.matrix() * measurement.covariance * rotation.matrix().transpose();
-    let point = (view.body_from_camera * Point3::from(measurement.point)).coords;
-    (point, covariance * view.config.filter.measurement_inflation)
-}
-
-fn seen_point(id: u64, pair: &PointPair) -> SeenPoint {
-    SeenPoint { id, in_body: pair.in_body, body_covariance: pair.body_covariance }
-}
-
-fn point_pair(correspondence: &Correspondence, view: &View) -> PointPair {
-    let (in_body, body_covariance) = in_body(&correspondence.measurement, view);
-    PointPair {
-        in_body,
-        body_covariance,
-        in_world: correspondence.world,
-        world_covariance: correspondence.world_covariance,
     }
 }
 

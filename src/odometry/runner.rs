@@ -7,17 +7,17 @@ use std::time::Instant;
 
 use super::{Event, FrontEndFrame, Odometry, StepReport};
 use crate::inertial::{ImuSample, Stamp};
-use crate::vision::{Feature, RgbdFrame};
+use crate::vision::{Extraction, RgbdFrame};
 
 /// Finds the features of one frame; holds no state that one frame hands to the next.
 pub trait FrontEnd: Send {
     /// A message that says why a frame has no features.
-    fn features(&mut self, frame: &RgbdFrame) -> Result<Vec<Feature>, String>;
+    fn features(&mut self, frame: &RgbdFrame) -> Result<Extraction, String>;
 }
 
 #[cfg(feature = "vision")]
 impl FrontEnd for crate::vision::OrbExtractor {
-    fn features(&mut self, frame: &RgbdFrame) -> Result<Vec<Feature>, String> {
+    fn features(&mut self, frame: &RgbdFrame) -> Result<Extraction, String> {
         self.extract(frame).map_err(|error| error.to_string())
     }
 }
@@ -112,13 +112,13 @@ fn prepare(event: Event, front_end: &mut dyn FrontEnd) -> Prepared {
     match event {
         Event::Frame(frame) => {
             let start = Instant::now();
-            let features = front_end.features(&frame).unwrap_or_else(|reason| {
+            let extraction = front_end.features(&frame).unwrap_or_else(|reason| {
                 tracing::warn!("frame at {} s: {reason}", frame.stamp);
-                Vec::new()
+                Extraction::default()
             });
             Prepared::Frame(FrontEndFrame {
                 frame,
-                features,
+                extraction,
                 seconds: start.elapsed().as_secs_f64(),
             })
         }

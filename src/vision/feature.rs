@@ -3,7 +3,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Point2, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{DepthReading, Patch, PinholeCamera};
+use super::{DepthReading, Patch, PinholeCamera, Pyramid};
 
 /// A 256-bit binary descriptor (ORB, BRIEF, ...).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -105,6 +105,14 @@ impl Feature {
         let moved = DepthReading { depth: depth.depth + depth.slope.dot(&shift), ..*depth };
         PointMeasurement::new(camera, self.pixel + shift, pixel_sigma, &moved)
     }
+}
+
+/// What a front end makes of one frame.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Extraction {
+    pub features: Vec<Feature>,
+    /// What they were found in.
+    pub pyramid: Pyramid,
 }
 
 /// How key points are found and how well they are localised.

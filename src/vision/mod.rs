@@ -12,6 +12,7 @@ mod matching;
 #[cfg(feature = "vision")]
 mod orb;
 pub mod patch;
+mod pyramid;
 pub mod ransac;
 #[cfg(feature = "vision")]
 mod select;
@@ -19,12 +20,13 @@ mod stereo;
 
 pub use camera::{CameraConfig, PinholeCamera};
 pub use depth::{DepthConfig, DepthReading};
-pub use feature::{Descriptor, Feature, FeatureConfig, PointMeasurement};
+pub use feature::{Descriptor, Extraction, Feature, FeatureConfig, PointMeasurement};
 pub use frame::RgbdFrame;
 pub use image::{ColorImage, DepthImage, PixelFormat};
 pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
 #[cfg(feature = "vision")]
 pub use orb::{OrbExtractor, VisionError};
 pub use patch::{Patch, PatchConfig};
+pub use pyramid::{Glimpse, Pyramid};
 pub use ransac::{Correspondence, RansacConfig, agree_near, agreeing, estimate_pose};
 pub use stereo::{StereoError, StereoRig, rectified_camera};

@@ -14,10 +14,11 @@ use opencv::prelude::*;
 use opencv::{calib3d, imgproc};
 
 use super::RgbdFrame;
+use super::pyramid::full_pixel;
 use super::select::{Corner, spread};
 use super::{
-    CameraConfig, DepthConfig, Descriptor, Feature, FeatureConfig, Patch, PinholeCamera,
-    PixelFormat,
+    CameraConfig, DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Patch,
+    PinholeCamera, PixelFormat, Pyramid,
 };
 
 /// Radius of the patch that orientation and descriptor are computed from, pixels of the level.
@@ -119,7 +120,7 @@ impl OrbExtractor {
     }
 
     /// Features of one frame, ordered by octave, row and column. None in the dark is no error.
-    pub fn extract(&mut self, frame: &RgbdFrame) -> Result<Vec<Feature>, VisionError> {
+    pub fn extract(&mut self, frame: &RgbdFrame) -> Result<Extraction, VisionError> {
         let color = (frame.color.width(), frame.color.height());
         let depth = (frame.depth.width(), frame.depth.height());
         if color != depth {
@@ -133,7 +134,17 @@ impl OrbExtractor {
         let (cell, spacing) = (self.config.cell_size, self.config.min_spacing);
         let corners = spread(corners, color.0, color.1, cell, spacing, self.config.max_features);
         let described = self.describe(&pyramid, &corners)?;
-        self.measure(frame, &pyramid, &described)
+        let features = self.measure(frame, &pyramid, &described)?;
+        Ok(Extraction { features, pyramid: self.copied(&pyramid)? })
+    }
+
+    fn copied(&self, levels: &[Mat]) -> Result<Pyramid, VisionError> {
+        let mut pyramid = Pyramid::default();
+        for (octave, level) in levels.iter().enumerate() {
+            let scale = self.config.scale_factor.powi(octave as i32);
+            pyramid.push(level.data_bytes()?.to_vec(), level.cols() as usize, scale);
+        }
+        Ok(pyramid)
     }
 
     /// The grey image and its reductions, as far as a patch fits into them.
@@ -328,13 +339,6 @@ fn grey(frame: &RgbdFrame) -> Result<Mat, VisionError> {
     Ok(grey)
 }
 
-/// From pixels of a level to those of the full image, `scale` times as large; pixel centres are
-/// at integers on both.
-fn full_pixel(level_pixel: Point2<f64>, scale: Vector2<f64>) -> Point2<f64> {
-    let half = Vector2::repeat(0.5);
-    Point2::from((level_pixel.coords + half).component_mul(&scale) - half)
-}
-
 fn patch_around(pyramid: &[Mat], corner: &Corner) -> Result<Option<Arc<Patch>>, VisionError> {
     let Some(level) = pyramid.get(usize::from(corner.level)) else { return Ok(None) };
     let patch = Patch::cut(level.data_bytes()?, level.cols() as usize, corner.column, corner.row);
@@ -378,6 +382,10 @@ mod tests {
         OrbExtractor::new(&FeatureConfig::default(), &CameraConfig::default(), &depth).unwrap()
     }
 
+    fn features(frame: &RgbdFrame) -> Vec<Feature> {
+        extractor().extract(frame).unwrap().features
+    }
+
     fn frame(width: usize, height: usize, grey: Vec<u8>) -> RgbdFrame {
         RgbdFrame {
             stamp: Stamp::default(),
@@ -404,11 +412,11 @@ mod tests {
     #[test]
     fn features_cover_the_image_in_a_stable_order() {
         let frame = frame(WIDTH, HEIGHT, collage(1));
-        let features = extractor().extract(&frame).unwrap();
-        assert!(features.len() > 300, "{}", features.len());
-        assert_eq!(features, extractor().extract(&frame).unwrap());
-        assert!(features.is_sorted_by_key(|f| f.octave));
-        for f in &features {
+        let found = features(&frame);
+        assert!(found.len() > 300, "{}", found.len());
+        assert_eq!(found, features(&frame));
+        assert!(found.is_sorted_by_key(|f| f.octave));
+        for f in &found {
             assert!((0.0..WIDTH as f64).contains(&f.pixel.x));
             assert!((0.0..HEIGHT as f64).contains(&f.pixel.y));
             assert!((f.depth.unwrap().depth - 2.0).abs() < 1e-9);
@@ -419,19 +427,18 @@ mod tests {
     fn darkness_and_tiny_images_have_no_features() {
         for (width, height) in [(1, 1), (640, 1), (33, 40), (WIDTH, HEIGHT)] {
             let black = frame(width, height, vec![0; width * height]);
-            assert_eq!(extractor().extract(&black).unwrap(), []);
+            assert_eq!(features(&black), []);
         }
     }
 
     #[test]
     fn dim_images_keep_most_features() {
-        let bright = extractor().extract(&frame(WIDTH, HEIGHT, collage(2))).unwrap();
+        let bright = features(&frame(WIDTH, HEIGHT, collage(2)));
         let dim = collage(2).into_iter().map(|v| (f64::from(v) * 0.5) as u8).collect();
-        let dim = extractor().extract(&frame(WIDTH, HEIGHT, dim)).unwrap();
+        let dim = features(&frame(WIDTH, HEIGHT, dim));
         assert!(dim.len() * 10 > bright.len() * 8, "{} of {}", dim.len(), bright.len());
     }
 
-    /// The second image is the first, moved by a known fraction of a pixel.
     #[test]
     fn images_of_different_sizes_are_refused() {
         let mut broken = frame(WIDTH, HEIGHT, collage(1));
@@ -467,8 +474,8 @@ mod tests {
         let square = (0..SIDE * SIDE).map(|i| at(i % SIDE, i / SIDE)).collect();
         // (x, y) goes to (SIDE - 1 - y, x).
         let turned = (0..SIDE * SIDE).map(|i| at(i / SIDE, SIDE - 1 - i % SIDE)).collect();
-        let a = extractor().extract(&frame(SIDE, SIDE, square)).unwrap();
-        let b = extractor().extract(&frame(SIDE, SIDE, turned)).unwrap();
+        let a = features(&frame(SIDE, SIDE, square));
+        let b = features(&frame(SIDE, SIDE, turned));
         let descriptors = |f: &[Feature]| f.iter().map(|f| f.descriptor).collect::<Vec<_>>();
         let matches =
             match_descriptors(&descriptors(&a), &descriptors(&b), &MatchingConfig::default());

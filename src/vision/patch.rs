@@ -35,9 +35,6 @@ pub struct PatchConfig {
     pub min_correlation: f64,
     /// Standard deviation of an aligned position, pixels of its pyramid level a coordinate.
     pub pixel_sigma: f64,
-    /// What motion adds to it, pixels for each pixel a second that the point moves in the image:
-    /// blur takes the corner out of patches and puts their errors of successive frames in common.
-    pub motion_sigma: f64,
     /// A reference seen at a scale that differs by more than this factor from the present one is
     /// replaced.
     pub max_scale_change: f64,
@@ -50,7 +47,6 @@ impl Default for PatchConfig {
             max_shift: 3.0,
             min_correlation: 0.8,
             pixel_sigma: 0.25,
-            motion_sigma: 5e-4,
             max_scale_change: 1.4,
         }
     }

@@ -126,6 +126,16 @@ pub struct Reprojection {
     pub max_depth_sigmas: f64,
 }
 
+impl Reprojection {
+    pub fn new(camera: &PinholeCamera, config: &RansacConfig) -> Self {
+        Self {
+            camera: *camera,
+            max_pixel_sigmas: config.max_pixel_sigmas,
+            max_depth_sigmas: config.max_depth_sigmas,
+        }
+    }
+}
+
 impl Consensus<Correspondence, Isometry3<f64>> for Reprojection {
     fn error(&self, world_from_camera: &Isometry3<f64>, datum: &Correspondence) -> f64 {
         let measured = &datum.measurement.point;
@@ -301,11 +311,7 @@ pub fn estimate_pose(
     config: &RansacConfig,
     seed: u64,
 ) -> Option<Agreement<Isometry3<f64>>> {
-    let consensus = Reprojection {
-        camera: *camera,
-        max_pixel_sigmas: config.max_pixel_sigmas,
-        max_depth_sigmas: config.max_depth_sigmas,
-    };
+    let consensus = Reprojection::new(camera, config);
     let mut sampler = UniformSampler::new(seed);
     let with_prior = rotation_prior.and_then(|rotation| {
         let estimator = KnownRotation(*rotation);
