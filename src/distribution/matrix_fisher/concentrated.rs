@@ -182,8 +182,8 @@ fn gaussian_coefficients(v: &[f64; 3], terms: usize) -> [f64; MAX_TERMS] {
     let mut power_sums = [0.0; MAX_TERMS];
     let mut g = [0.0; MAX_TERMS];
     g[0] = 1.0;
-    for n in 1..terms {
-        power_sums[n] = powers.iter().sum();
+    for sum in &mut power_sums[1..terms] {
+        *sum = powers.iter().sum();
         for (power, v) in powers.iter_mut().zip(v) {
             *power *= v;
         }

@@ -85,11 +85,11 @@ pub(super) fn propagate(
     let with_rate = [0, 1, 2].map(|l| third.weighted(&by_r.column(l).into_owned()));
     let complement = Matrix3::from_diagonal(&moments.complement());
     let mut x = complement + loss - complement * loss;
-    for l in 0..3 {
+    for (l, weighted) in with_rate.iter().enumerate() {
         let axis = hat(&Vector3::ith(l, 1.0));
         x -= matrix(&(second * by_r.column(l))) * axis;
         for m in 0..3 {
-            x -= matrix(&(with_rate[l] * by_r.column(m))) * axis * hat(&Vector3::ith(m, 0.5));
+            x -= matrix(&(weighted * by_r.column(m))) * axis * hat(&Vector3::ith(m, 0.5));
         }
     }
     let mean = PolarMean::from_deviation(&Rotation3::identity(), &x)?.principal();
