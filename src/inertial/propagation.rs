@@ -83,10 +83,6 @@ impl Propagator {
         self.in_gap = in_gap;
     }
 
-    pub fn is_in_imu_gap(&self) -> bool {
-        self.in_gap
-    }
-
     pub fn model(&self) -> MotionModel {
         self.model
     }

@@ -569,7 +569,6 @@ impl VisualInertialFilter for SlamFilter {
         if let Some(step) = step {
             self.measured_rate = to.angular_velocity;
             self.timed_by = self.calibration;
-            self.turned_alone |= self.propagator.is_in_imu_gap();
             self.carried += to.stamp.seconds_since(from.stamp).max(0.0);
             self.transition = step * self.transition;
             if let Some(gravity) = &mut self.gravity {
@@ -581,6 +580,7 @@ impl VisualInertialFilter for SlamFilter {
 
     fn set_imu_gap(&mut self, in_gap: bool) {
         self.propagator.set_imu_gap(in_gap);
+        self.turned_alone |= in_gap;
     }
 
     fn coast(&mut self, seconds: f64) {
