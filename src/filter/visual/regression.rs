@@ -1,6 +1,8 @@
 //! The regression of the Euclidean state on the rotation, and how points condition it.
 
-use nalgebra::{DMatrix, DMatrixViewMut, Matrix3, Rotation3, SMatrix, SVector, Vector3};
+use nalgebra::{
+    DMatrix, DMatrixViewMut, Dyn, Matrix3, OMatrix, Rotation3, SMatrix, SVector, U3, Vector3,
+};
 
 use crate::distribution::rotation_quadratic::{
     RotationQuadratic, rotated_vector_by_rotation, vectorize,
@@ -23,8 +25,8 @@ pub enum Coordinates {
     /// On the rotation matrix: a world vector is `y = R R^T_hat y_hat + B r + noise`,
     /// `r = vec(R)`, with a matrix Fisher density of `R`; places turn about that of the body. A
     /// common turn of body and map is `R -> G R`, under which this form keeps its parameters:
-    /// turning what cannot be observed changes nothing that is measured. Where what is uncertain
-    /// of the rotation is not shared by the map, as in a gap of the IMU's data, it is
+    /// turning what cannot be observed changes nothing that is measured. Where most of what is
+    /// uncertain of the rotation is not shared by the map, as in a gap of the IMU's data, it is
     /// `y = y_hat + B r + noise`: points that turned would, by the second order, be drawn towards
     /// the body, frame by frame.
     Group,
@@ -100,7 +102,6 @@ impl<'a> Regression<'a> {
         prior_means: &'a [Vector3<f64>],
         calibration: Option<usize>,
         points_from: usize,
-        shares_turns: bool,
         covariance: &DMatrix<f64>,
     ) -> Option<Self> {
         let n = covariance.ncols() - 3;
@@ -117,7 +118,7 @@ impl<'a> Regression<'a> {
             prior_means,
             calibration,
             points_from,
-            shared: if shares_turns { 1.0 } else { 0.0 },
+            shared: shared_turn(prior, prior_means, points_from, &by_rotation),
             rotation_information,
             rotation_covariance,
             slope: DMatrix::zeros(n, coordinates.size()),
@@ -407,6 +408,25 @@ impl Coordinates {
         }
         derivative
     }
+}
+
+/// Whether the points share turns of the body by their regression on it (1, also without points) or
+/// not (0), whichever is nearer to the best common factor in the sense of least squares.
+fn shared_turn(
+    prior: &Rotation3<f64>,
+    means: &[Vector3<f64>],
+    points_from: usize,
+    by_rotation: &OMatrix<f64, Dyn, U3>,
+) -> f64 {
+    let of_place = by_rotation.fixed_view::<3, 3>(3 * POSITION, 0);
+    let (mut shared, mut total) = (0.0, 0.0);
+    for (k, mean) in means.iter().enumerate().skip(points_from) {
+        let arm = prior.inverse() * (mean - means[POSITION]);
+        let turned = -prior.matrix() * arm.cross_matrix();
+        shared += (by_rotation.fixed_view::<3, 3>(3 * k, 0) - of_place).dot(&turned);
+        total += turned.norm_squared();
+    }
+    if total > 0.0 && shared < 0.5 * total { 0.0 } else { 1.0 }
 }
 
 /// `K` of a matrix Fisher density `F = M K` with the given information (minus the Hessian of its

@@ -64,9 +64,6 @@ pub struct SlamFilter {
     measured_rate: Vector3<f64>,
     /// Time that the IMU has carried the belief since points last corrected it, s.
     carried: f64,
-    /// Whether the body has turned since then by what the map does not share: a gap in the IMU's
-    /// data, or readings that the points contradict.
-    turned_alone: bool,
     /// Whether the heading is that of an arbitrary world: uniform, and independent of all else.
     heading_is_free: bool,
     gate: Gate,
@@ -97,7 +94,6 @@ impl SlamFilter {
             timed_by: None,
             measured_rate: Vector3::zeros(),
             carried: 0.0,
-            turned_alone: false,
             heading_is_free: false,
             gate: Gate::new(config),
             passed: Vec::new(),
@@ -240,12 +236,10 @@ impl SlamFilter {
         for variance in if few { &[1.0][..] } else { &[1.0, 16.0, 256.0] } {
             let Some(distrust) = distrust.filter(|_| latest.contradicts()) else { break };
             self.belief.covariance = certain + distrust * *variance;
-            self.turned_alone = true;
             self.synchronize();
             let Some(widened) = self.conditioned(measurements) else { break };
             latest = widened;
         }
-        self.turned_alone = false;
         let astray = latest.turns_too_far || few && latest.contradicts();
         let Conditioned { posterior, outcome, .. } = latest;
         if astray || self.accept(posterior).is_none() {
@@ -267,16 +261,7 @@ impl SlamFilter {
         let covariance = seen.as_ref().unwrap_or(&self.covariance);
         let points = self.base() / 3 - 1;
         let of_prior = || {
-            let shares = !self.turned_alone;
-            Regression::of_prior(
-                self.coordinates,
-                &prior,
-                &means,
-                calibration,
-                points,
-                shares,
-                covariance,
-            )
+            Regression::of_prior(self.coordinates, &prior, &means, calibration, points, covariance)
         };
         let mut regression = of_prior()?;
         let screening = self.gate.judge(regression.squared_distances(measurements)?.into_iter());
@@ -580,7 +565,6 @@ impl VisualInertialFilter for SlamFilter {
 
     fn set_imu_gap(&mut self, in_gap: bool) {
         self.propagator.set_imu_gap(in_gap);
-        self.turned_alone |= in_gap;
     }
 
     fn coast(&mut self, seconds: f64) {
