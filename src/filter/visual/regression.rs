@@ -1,8 +1,6 @@
 //! The regression of the Euclidean state on the rotation, and how points condition it.
 
-use nalgebra::{
-    DMatrix, DMatrixViewMut, Dyn, Matrix3, OMatrix, Rotation3, SMatrix, SVector, U3, Vector3,
-};
+use nalgebra::{DMatrix, DMatrixViewMut, Matrix3, Rotation3, SMatrix, SVector, Vector3};
 
 use crate::distribution::rotation_quadratic::{
     RotationQuadratic, rotated_vector_by_rotation, vectorize,
@@ -23,12 +21,9 @@ const BATCH: usize = 16;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Coordinates {
     /// On the rotation matrix: a world vector is `y = R R^T_hat y_hat + B r + noise`,
-    /// `r = vec(R)`, with a matrix Fisher density of `R`; places turn about that of the body. A
-    /// common turn of body and map is `R -> G R`, under which this form keeps its parameters:
-    /// turning what cannot be observed changes nothing that is measured. Where most of what is
-    /// uncertain of the rotation is not shared by the map, as in a gap of the IMU's data, it is
-    /// `y = y_hat + B r + noise`: points that turned would, by the second order, be drawn towards
-    /// the body, frame by frame.
+    /// `r = vec(R)`, with a matrix Fisher density of `R`. A common turn of body and map is
+    /// `R -> G R`, under which this form keeps its parameters: turning what cannot be observed
+    /// changes nothing that is measured.
     Group,
     /// On the rotation vector at the estimate, as an extended Kalman filter does:
     /// `y = y_hat + B e + noise`.
@@ -73,10 +68,6 @@ pub(super) struct Regression<'a> {
     prior_means: &'a [Vector3<f64>],
     /// First block of the calibration of the camera, which is no vector of the world either.
     calibration: Option<usize>,
-    /// First block of the points.
-    points_from: usize,
-    /// 1 where the map shares turns of the body, else 0.
-    shared: f64,
     rotation_information: Matrix3<f64>,
     rotation_covariance: Matrix3<f64>,
     slope: DMatrix<f64>,
@@ -101,7 +92,6 @@ impl<'a> Regression<'a> {
         prior: &'a Rotation3<f64>,
         prior_means: &'a [Vector3<f64>],
         calibration: Option<usize>,
-        points_from: usize,
         covariance: &DMatrix<f64>,
     ) -> Option<Self> {
         let n = covariance.ncols() - 3;
@@ -117,8 +107,6 @@ impl<'a> Regression<'a> {
             prior,
             prior_means,
             calibration,
-            points_from,
-            shared: shared_turn(prior, prior_means, points_from, &by_rotation),
             rotation_information,
             rotation_covariance,
             slope: DMatrix::zeros(n, coordinates.size()),
@@ -126,9 +114,9 @@ impl<'a> Regression<'a> {
             evidence: DMatrix::zeros(coordinates.size(), coordinates.size()),
         };
         for (k, mean) in prior_means.iter().enumerate().filter(|(k, _)| sum.turns(*k)) {
-            let in_body = prior.inverse() * (mean - sum.centre(k));
+            let in_body = prior.inverse() * mean;
             let mut rows = by_rotation.fixed_view_mut::<3, 3>(3 * k, 0);
-            rows += prior.matrix() * in_body.cross_matrix() * sum.shared;
+            rows += prior.matrix() * in_body.cross_matrix();
         }
         match coordinates {
             Coordinates::Group => {
@@ -146,12 +134,6 @@ impl<'a> Regression<'a> {
             .calibration
             .is_some_and(|first| (first..first + CALIBRATION_BLOCKS).contains(&block));
         self.coordinates == Coordinates::Group && !BIASES.contains(&block) && !calibrates
-    }
-
-    /// What a block of `x_0` turns about.
-    fn centre(&self, block: usize) -> Vector3<f64> {
-        let is_place = block == POSITION || block >= self.points_from;
-        if is_place { self.prior_means[POSITION] } else { Vector3::zeros() }
     }
 
     /// Squared Mahalanobis distance of each measurement from what is expected of it.
@@ -239,14 +221,13 @@ impl<'a> Regression<'a> {
         let last = rows.ncols() - 1;
         match self.coordinates {
             Coordinates::Group => {
-                // A point of the state turns with the body as far as the map does; a known one stays.
-                let stays = match measurement.target {
-                    Target::State { .. } => 1.0 - self.shared,
-                    Target::Known { .. } => 1.0,
-                };
-                for i in 0..3 {
-                    for k in 0..3 {
-                        rows[(i, 3 * k + i)] += stays * expected[k];
+                // A point of the state turns with the body by itself, a known one stays.
+                if let Target::Known { .. } = measurement.target {
+                    let in_body = self.prior.inverse() * target;
+                    for i in 0..3 {
+                        for k in 0..3 {
+                            rows[(i, 3 * k + i)] += in_body[k];
+                        }
                     }
                 }
             }
@@ -336,12 +317,10 @@ impl<'a> Regression<'a> {
         for (k, mean) in means.iter_mut().enumerate() {
             *mean += shift.fixed_rows::<3>(3 * k);
             if self.turns(k) {
-                let centre = self.centre(k);
-                let from_centre = *mean - centre;
-                let in_body = self.prior.inverse() * from_centre;
-                *mean += (mode * in_body - from_centre) * self.shared;
+                let in_body = self.prior.inverse() * *mean;
+                *mean = mode * in_body;
                 let mut rows = by_rotation.fixed_view_mut::<3, 3>(3 * k, 0);
-                rows -= mode.matrix() * in_body.cross_matrix() * self.shared;
+                rows -= mode.matrix() * in_body.cross_matrix();
             }
             *mean += moved.fixed_rows::<3>(3 * k);
         }
@@ -408,25 +387,6 @@ impl Coordinates {
         }
         derivative
     }
-}
-
-/// Whether the points share turns of the body by their regression on it (1, also without points) or
-/// not (0), whichever is nearer to the best common factor in the sense of least squares.
-fn shared_turn(
-    prior: &Rotation3<f64>,
-    means: &[Vector3<f64>],
-    points_from: usize,
-    by_rotation: &OMatrix<f64, Dyn, U3>,
-) -> f64 {
-    let of_place = by_rotation.fixed_view::<3, 3>(3 * POSITION, 0);
-    let (mut shared, mut total) = (0.0, 0.0);
-    for (k, mean) in means.iter().enumerate().skip(points_from) {
-        let arm = prior.inverse() * (mean - means[POSITION]);
-        let turned = -prior.matrix() * arm.cross_matrix();
-        shared += (by_rotation.fixed_view::<3, 3>(3 * k, 0) - of_place).dot(&turned);
-        total += turned.norm_squared();
-    }
-    if total > 0.0 && shared < 0.5 * total { 0.0 } else { 1.0 }
 }
 
 /// `K` of a matrix Fisher density `F = M K` with the given information (minus the Hessian of its

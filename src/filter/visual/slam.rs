@@ -259,10 +259,8 @@ impl SlamFilter {
         let calibration = self.calibration.map(|_| self.after_gravity() / 3 - 1);
         let seen = calibration.map(|_| self.with_camera(self.covariance.clone(), -1.0));
         let covariance = seen.as_ref().unwrap_or(&self.covariance);
-        let points = self.base() / 3 - 1;
-        let of_prior = || {
-            Regression::of_prior(self.coordinates, &prior, &means, calibration, points, covariance)
-        };
+        let of_prior =
+            || Regression::of_prior(self.coordinates, &prior, &means, calibration, covariance);
         let mut regression = of_prior()?;
         let screening = self.gate.judge(regression.squared_distances(measurements)?.into_iter());
         let passed = measurements.iter().zip(self.gate.passed()).filter(|(_, passed)| **passed);
@@ -1018,37 +1016,6 @@ mod tests {
             let nees = error.dot(&covariance.cholesky().unwrap().solve(&error));
             prop_assert!(nees < 21.1, "{nees} (99.99 %)");
         }
-    }
-
-    /// Turns that the map does not share, as in a gap of the IMU's data, leave both where they are,
-    /// however far from the world's origin.
-    #[test]
-    fn a_turn_without_the_map_moves_neither() {
-        let mut rng = ChaCha8Rng::seed_from_u64(29);
-        let mut prior = belief(&mut rng, 0.01);
-        prior.covariance *= 1e-4;
-        prior.state.velocity = Vector3::zeros();
-        prior.state.world_from_body.translation.vector = Vector3::new(10.0, -6.0, 2.0);
-        let mut mfgs = filter(FilterKind::Mfgs, prior);
-        let noise = Matrix3::identity() * 0.002f64.powi(2);
-        let points: Vec<_> = (0..30).map(|id| seen(id, vector(&mut rng, 2.0), noise)).collect();
-        let state = mfgs.point_state().unwrap();
-        assert!(points.iter().all(|point| state.admit(point)));
-        mfgs.set_imu_gap(true);
-        let up = prior.state.world_from_body.rotation.inverse() * Vector3::z();
-        for frame in 0..20 {
-            let sample = |k: i64| ImuSample {
-                stamp: Stamp::from_nanos((frame + k) * 33_000_000),
-                angular_velocity: Vector3::new(1.5, -1.0, 0.5) + prior.state.gyro_bias,
-                specific_force: up * ImuConfig::default().gravity + prior.state.accel_bias,
-            };
-            assert!(mfgs.propagate(&sample(0), &sample(1)));
-            assert!(mfgs.point_state().unwrap().measure(&points).is_some());
-        }
-        let (before, after) = (prior.state.world_from_body, mfgs.belief().state.world_from_body);
-        let moved = (after.translation.vector - before.translation.vector).norm();
-        assert!(moved < 2e-3, "{moved} m");
-        assert!(before.rotation.angle_to(&after.rotation) < 2e-3);
     }
 
     #[test]
