@@ -39,7 +39,7 @@ pub struct FrontEndFrame {
 }
 
 /// Visual-inertial odometry: IMU samples, frames and reference poses go in, in order of time;
-/// one [`StepReport`] a frame comes out of [`Self::step`], as soon as the IMU has reached it.
+/// one [`StepReport`] a frame comes out of [`Self::step`], as soon as IMU and reference have reached it.
 ///
 /// A step costs `O(F + M)` in features and map points; the belief is of fixed size.
 pub struct Odometry {
@@ -90,8 +90,9 @@ pub struct OdometryStats {
     pub health: HealthSummary,
 }
 
-/// How long a frame waits for the IMU to reach it before the gap is bridged, s.
-const IMU_PATIENCE: f64 = 1.0;
+/// How long a frame waits for the IMU to reach it before the gap is bridged, and for the reference,
+/// s.
+const PATIENCE: f64 = 1.0;
 
 /// Fewer matches than this may agree on a pose by chance.
 const FEW_ASTRAY: usize = 30;
@@ -258,9 +259,8 @@ impl Odometry {
         }
         let (_, front) = self.frames.front()?;
         let stamp = self.frame_time(front);
-        let imu_reached = self.imu.back().is_some_and(|sample| sample.stamp >= stamp);
-        let late = self.now.is_some_and(|now| now.seconds_since(stamp) > IMU_PATIENCE);
-        if self.has_imu && !imu_reached && !self.ended && !late {
+        let late = self.now.is_some_and(|now| now.seconds_since(stamp) > PATIENCE);
+        if !self.has_reached(stamp) && !self.ended && !late {
             return None;
         }
         let (number, mut front) = self.frames.pop_front()?;
@@ -269,6 +269,13 @@ impl Odometry {
             self.leave_off(divergence, stamp);
         }
         Some((report, front.frame))
+    }
+
+    /// Whether the IMU has, and the reference, which is compared with the estimate at every frame.
+    fn has_reached(&self, stamp: Stamp) -> bool {
+        let imu = self.imu.back().is_some_and(|sample| sample.stamp >= stamp);
+        let reference = self.truth.newest().is_none_or(|newest| newest >= stamp);
+        (imu || !self.has_imu) && reference
     }
 
     /// When a frame was taken by the IMU's clock, as far as is known.
@@ -1002,5 +1009,47 @@ impl StageClock {
         let seconds = (now - self.0).as_secs_f64();
         self.0 = now;
         seconds
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::vision::{ColorImage, DepthImage, PixelFormat};
+
+    fn at(seconds: f64) -> Stamp {
+        Stamp::from_seconds(1_305_031_229.0 + seconds).unwrap()
+    }
+
+    fn truth(seconds: f64) -> TruthPose {
+        TruthPose { stamp: at(seconds), world_from_body: Isometry3::identity() }
+    }
+
+    fn frame(seconds: f64) -> FrontEndFrame {
+        let color = ColorImage::new(8, 8, PixelFormat::Rgb8, vec![0; 192]).unwrap();
+        let depth = DepthImage::new(8, 8, 0.001, vec![0; 64]).unwrap();
+        let frame = Box::new(RgbdFrame { stamp: at(seconds), color, depth });
+        FrontEndFrame { frame, extraction: Extraction::default(), seconds: 0.0 }
+    }
+
+    #[test]
+    fn a_frame_waits_for_the_reference_pose_after_it() {
+        let config = OdometryConfig::default();
+        let mut odometry = Odometry::new(&config, FilterKind::Mfgr, 1, false).unwrap();
+        odometry.push_truth(truth(0.0));
+        odometry.push_frame(frame(0.005));
+        assert!(odometry.step().is_none());
+        odometry.push_truth(truth(0.01));
+        let (report, _) = odometry.step().unwrap();
+        assert!(odometry.truth().at(report.stamp, config.truth.max_gap).is_some());
+
+        // A reference that has ended holds nothing up for long.
+        odometry.push_frame(frame(0.04));
+        assert!(odometry.step().is_none());
+        odometry.push_frame(frame(0.04 + 1.1 * PATIENCE));
+        assert_eq!(odometry.step().unwrap().0.stamp, at(0.04));
+        assert!(odometry.step().is_none());
+        odometry.end();
+        assert!(odometry.step().is_some());
     }
 }
