@@ -96,6 +96,8 @@ struct Report {
     start: f64,
     imu_samples: usize,
     gaps: usize,
+    /// Gaps that were filled in by interpolation.
+    interpolated: usize,
     fixes_used: usize,
     fixes_rejected: usize,
     /// Fixes that enlarged the belief.
@@ -137,6 +139,8 @@ struct OutageLine {
     fixes: usize,
     rms_m: f64,
     max_m: f64,
+    /// Mean normalized square, 3 if the belief is right.
+    nis: f64,
     last_m: f64,
 }
 
@@ -239,6 +243,7 @@ fn outage_lines(summary: &NavigationSummary) -> Vec<OutageLine> {
         fixes: o.fixes,
         rms_m: o.rms,
         max_m: o.max,
+        nis: o.nis,
         last_m: o.last,
     };
     summary.outages.iter().map(line).collect()
@@ -260,6 +265,7 @@ fn report(
         start: summary.start.seconds(),
         imu_samples: summary.imu_samples,
         gaps: summary.gaps,
+        interpolated: summary.interpolated,
         fixes_used: summary.used,
         fixes_rejected: summary.rejected,
         surprises: summary.surprises,
@@ -276,7 +282,10 @@ fn report(
 fn print(report: &Report, config: &GnssConfig) {
     println!("filter                {} ({})", report.filter, report.config);
     println!("first fix             {:.3} s", report.start);
-    println!("IMU samples, gaps     {}, {}", report.imu_samples, report.gaps);
+    println!(
+        "IMU samples, gaps     {}, {} and {} filled in",
+        report.imu_samples, report.gaps, report.interpolated
+    );
     println!(
         "fixes                 {} used, {} rejected, {} a surprise",
         report.fixes_used, report.fixes_rejected, report.surprises
@@ -305,8 +314,15 @@ fn print(report: &Report, config: &GnssConfig) {
     if report.outages.is_empty() {
         return;
     }
-    let mut table =
-        Table::new(["outage from, s", "filter", "fixes", "position RMS, m", "max, m", "last, m"]);
+    let mut table = Table::new([
+        "outage from, s",
+        "filter",
+        "fixes",
+        "position RMS, m",
+        "max, m",
+        "last, m",
+        "NIS",
+    ]);
     let mut add = |filter: &str, lines: &[OutageLine]| {
         for line in lines {
             table.push([
@@ -316,6 +332,7 @@ fn print(report: &Report, config: &GnssConfig) {
                 format!("{:.2}", line.rms_m),
                 format!("{:.2}", line.max_m),
                 format!("{:.2}", line.last_m),
+                format!("{:.1}", line.nis),
             ]);
         }
     };

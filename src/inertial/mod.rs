@@ -1,6 +1,7 @@
 //! Sensor time, IMU samples and their noise, and how a belief about the motion of the body is
 //! carried through the kinematics.
 
+mod coverage;
 mod directions;
 mod imu;
 mod initial;
@@ -8,6 +9,7 @@ mod propagation;
 mod stamp;
 mod state;
 
+pub use coverage::Coverage;
 pub use directions::{
     BodyDirection, DirectionConfig, DirectionFinder, Directions, GravityConfig, MagneticConfig,
     RestConfig,

@@ -26,6 +26,9 @@ pub struct ReceiverConfig {
     pub horizontal_noise: f64,
     /// Standard deviation of a fix along the vertical, m.
     pub vertical_noise: f64,
+    /// Standard deviation, m, of what is added to each axis of a fix that lies within a stretch of
+    /// interpolated IMU samples, because such a log has interpolated positions, too.
+    pub interpolated_noise: f64,
     /// The antenna in body coordinates, m.
     pub lever_arm: [f64; 3],
     /// A fix is rejected if its normalized innovation squared exceeds the chi-square bound of this
@@ -43,6 +46,7 @@ impl Default for ReceiverConfig {
         Self {
             horizontal_noise: 1.0,
             vertical_noise: 2.0,
+            interpolated_noise: 0.0,
             lever_arm: [0.0; 3],
             gate_probability: 1.0,
             max_rejected: 5,
@@ -51,11 +55,19 @@ impl Default for ReceiverConfig {
 }
 
 impl ReceiverConfig {
-    pub(super) fn measurement(&self, position: Vector3<f64>) -> PositionMeasurement {
+    /// The measurement that is a fix, `interpolated` with the IMU's samples around it or not.
+    pub(super) fn measurement(
+        &self,
+        position: Vector3<f64>,
+        interpolated: bool,
+    ) -> PositionMeasurement {
+        let added = if interpolated { self.interpolated_noise.powi(2) } else { 0.0 };
         let (horizontal, vertical) = (self.horizontal_noise.powi(2), self.vertical_noise.powi(2));
         PositionMeasurement {
             in_world: position,
-            covariance: Matrix3::from_diagonal(&Vector3::new(horizontal, horizontal, vertical)),
+            covariance: Matrix3::from_diagonal(
+                &Vector3::new(horizontal, horizontal, vertical).add_scalar(added),
+            ),
             lever_arm: Vector3::from(self.lever_arm),
         }
     }
@@ -189,6 +201,9 @@ impl GnssConfig {
             ("imu.accel_noise", self.imu.accel_noise),
             ("imu.gyro_bias_walk", self.imu.gyro_bias_walk),
             ("imu.accel_bias_walk", self.imu.accel_bias_walk),
+            ("imu.gap_gyro_noise", self.imu.gap_gyro_noise),
+            ("imu.gap_accel_noise", self.imu.gap_accel_noise),
+            ("receiver.interpolated_noise", self.receiver.interpolated_noise),
             ("receiver.gate_probability", self.receiver.gate_probability),
             ("filter.surprise_probability", self.filter.surprise_probability),
             ("start.window", self.start.window),

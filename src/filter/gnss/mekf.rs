@@ -168,6 +168,10 @@ impl GnssFilter for MekfGnss {
         }
     }
 
+    fn set_imu_gap(&mut self, in_gap: bool) {
+        self.propagator.set_imu_gap(in_gap);
+    }
+
     fn enlarge(&mut self, factor: f64) -> Result<(), FilterError> {
         self.belief.covariance *= factor;
         Ok(())

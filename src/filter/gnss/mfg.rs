@@ -95,6 +95,10 @@ impl GnssFilter for MfgGnss {
         }
     }
 
+    fn set_imu_gap(&mut self, in_gap: bool) {
+        self.propagator.set_imu_gap(in_gap);
+    }
+
     fn enlarge(&mut self, factor: f64) -> Result<(), FilterError> {
         self.belief = self.belief.enlarged(factor)?;
         Ok(())

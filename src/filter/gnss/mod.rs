@@ -134,6 +134,9 @@ pub trait GnssFilter: BayesFilter {
     /// Adds an independent error of this variance (m^2) to each component of the position.
     fn loosen_position(&mut self, variance: f64);
 
+    /// Whether what follows is propagated with the noise of a gap in the IMU's data.
+    fn set_imu_gap(&mut self, in_gap: bool);
+
     /// Multiplies the covariance of the belief, about the same estimate.
     fn enlarge(&mut self, factor: f64) -> Result<(), FilterError>;
 

@@ -7,7 +7,7 @@ use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use super::{GnssConfig, GnssFilter, GnssFilterKind, InitialBelief, Innovation};
 use crate::filter::{FilterError, InertialStep};
 use crate::inertial::{
-    Belief, ImuConfig, ImuSample, InitialAttitude, NavState, PositionFix, Stamp, block,
+    Belief, Coverage, ImuSample, InitialAttitude, NavState, PositionFix, Stamp, block,
 };
 
 /// Why a run cannot start or go on.
@@ -77,6 +77,8 @@ pub struct OutageReport {
     pub fixes: usize,
     /// Root mean square, m.
     pub rms: f64,
+    /// Mean of the normalized squares, 3 if the belief is right.
+    pub nis: f64,
     pub max: f64,
     /// At the last withheld fix, m.
     pub last: f64,
@@ -89,6 +91,8 @@ pub struct NavigationSummary {
     pub imu_samples: usize,
     /// Intervals between samples longer than `imu.max_gap` since the start.
     pub gaps: usize,
+    /// Such intervals that were filled in by interpolation.
+    pub interpolated: usize,
     pub used: usize,
     pub rejected: usize,
     /// Fixes that enlarged the belief (`filter.surprise_probability`).
@@ -120,16 +124,17 @@ pub fn navigate(
     }
     check_order("IMU samples", imu.iter().map(|sample| sample.stamp))?;
     check_order("fixes", fixes.iter().map(|fix| fix.stamp))?;
-    let Start { origin, samples, fixes } = find_start(&config.imu, imu, fixes)?;
+    let coverage = Coverage::before_each(imu, config.imu.max_gap);
+    let Start { origin, samples, coverage, fixes } = find_start(config, imu, &coverage, fixes)?;
     let (mut run, first) = Run::start(kind, config, &origin, samples, &fixes[0])?;
     let mut waiting = fixes[1..].iter().peekable();
     let mut now = origin;
     if observe(&first).is_break() {
         return Ok(run.finish());
     }
-    for sample in samples {
-        let sample = scaled(&config.imu, sample);
-        run.count(&now, &sample);
+    for (sample, &coverage) in samples.iter().zip(coverage) {
+        let sample = sample.scaled(&config.imu);
+        run.enter(coverage);
         while let Some(fix) = waiting.next_if(|fix| fix.stamp <= sample.stamp) {
             let at_fix = ImuSample::between(&now, &sample, fix.stamp);
             run.advance(&now, &at_fix)?;
@@ -169,22 +174,29 @@ struct Start<'a> {
     origin: ImuSample,
     /// Samples after it.
     samples: &'a [ImuSample],
+    /// Of the interval before each of them.
+    coverage: &'a [Coverage],
     /// The first fix and those after it; not empty.
     fixes: &'a [PositionFix],
 }
 
 fn find_start<'a>(
-    config: &ImuConfig,
+    config: &GnssConfig,
     imu: &'a [ImuSample],
+    coverage: &'a [Coverage],
     fixes: &'a [PositionFix],
 ) -> Result<Start<'a>, NavigationError> {
     for (number, fix) in fixes.iter().enumerate() {
         let after = imu.partition_point(|sample| sample.stamp <= fix.stamp);
         let (Some(before), Some(next)) = (imu[..after].last(), imu.get(after)) else { continue };
-        if next.stamp.seconds_since(before.stamp) <= config.max_gap {
-            let origin =
-                ImuSample::between(&scaled(config, before), &scaled(config, next), fix.stamp);
-            return Ok(Start { origin, samples: &imu[after..], fixes: &fixes[number..] });
+        if coverage[after] != Coverage::Gap {
+            let [before, next] = [before, next].map(|sample| sample.scaled(&config.imu));
+            return Ok(Start {
+                origin: ImuSample::between(&before, &next, fix.stamp),
+                samples: &imu[after..],
+                coverage: &coverage[after..],
+                fixes: &fixes[number..],
+            });
         }
     }
     let (Some(first), Some(last)) = (imu.first(), imu.last()) else {
@@ -194,7 +206,7 @@ fn find_start<'a>(
         return Err(NavigationError::Empty);
     };
     Err(NavigationError::NoStart {
-        max_gap: config.max_gap,
+        max_gap: config.imu.max_gap,
         imu: imu.len(),
         fixes: fixes.len(),
         imu_range: [first.stamp, last.stamp],
@@ -202,19 +214,12 @@ fn find_start<'a>(
     })
 }
 
-fn scaled(config: &ImuConfig, sample: &ImuSample) -> ImuSample {
-    ImuSample {
-        stamp: sample.stamp,
-        angular_velocity: sample.angular_velocity * config.gyroscope_scale,
-        specific_force: sample.specific_force * config.accelerometer_scale,
-    }
-}
-
 struct Run<'a> {
     config: &'a GnssConfig,
     filter: Box<dyn GnssFilter>,
     gate: f64,
     surprise: f64,
+    coverage: Coverage,
     rejected_in_a_row: usize,
     last_output: Stamp,
     outages: OutageErrors,
@@ -234,13 +239,14 @@ impl<'a> Run<'a> {
         let initial = initial_belief(config, origin, samples, fix)?;
         let method = config.filter.attitude_update;
         let mut filter = kind.start(&config.imu, method, &initial).map_err(at)?;
-        let position = config.receiver.measurement(fix.position);
+        let position = config.receiver.measurement(fix.position, false);
         filter.update_position(&position).map_err(at)?;
         let mut run = Self {
             config,
             filter,
             gate: config.receiver.gate(),
             surprise: config.filter.surprise(),
+            coverage: Coverage::Measured,
             rejected_in_a_row: 0,
             last_output: fix.stamp,
             outages: OutageErrors::default(),
@@ -250,11 +256,14 @@ impl<'a> Run<'a> {
         Ok((run, step))
     }
 
-    fn count(&mut self, from: &ImuSample, to: &ImuSample) {
+    /// Goes on to the next sample.
+    fn enter(&mut self, coverage: Coverage) {
         self.summary.imu_samples += 1;
-        if to.stamp.seconds_since(from.stamp) > self.config.imu.max_gap {
-            self.summary.gaps += 1;
-        }
+        self.summary.gaps += usize::from(coverage == Coverage::Gap);
+        let filled_in = coverage == Coverage::Interpolated && self.coverage != coverage;
+        self.summary.interpolated += usize::from(filled_in);
+        self.coverage = coverage;
+        self.filter.set_imu_gap(coverage != Coverage::Measured);
     }
 
     fn advance(&mut self, from: &ImuSample, to: &ImuSample) -> Result<(), NavigationError> {
@@ -277,10 +286,11 @@ impl<'a> Run<'a> {
     fn fix(&mut self, fix: &PositionFix) -> Result<NavigationStep, NavigationError> {
         let at = |source| NavigationError::Step { stamp: fix.stamp, source };
         let elapsed = fix.stamp.seconds_since(self.summary.start);
-        let position = self.config.receiver.measurement(fix.position);
+        let interpolated = self.coverage == Coverage::Interpolated;
+        let position = self.config.receiver.measurement(fix.position, interpolated);
         let innovation = self.filter.innovation(&position).map_err(at)?;
         let fate = if let Some(number) = self.config.outage.index_at(elapsed) {
-            self.outages.add(number, elapsed, innovation.residual.norm());
+            self.outages.add(number, elapsed, &innovation);
             FixUse::Outage(number)
         } else if innovation.nis > self.gate
             && self.rejected_in_a_row < self.config.receiver.max_rejected
@@ -344,7 +354,7 @@ fn initial_belief(
     let in_window =
         samples.iter().take_while(|s| s.stamp.seconds_since(origin.stamp) <= start.window);
     let window: Vec<ImuSample> =
-        std::iter::once(*origin).chain(in_window.map(|s| scaled(&config.imu, s))).collect();
+        std::iter::once(*origin).chain(in_window.map(|s| s.scaled(&config.imu))).collect();
     let (tilt_sd, heading_sd) = (start.tilt_sd.to_radians(), start.heading_sd.to_radians());
     let level = InitialAttitude::level(&window, Vector3::zeros(), tilt_sd, heading_sd)
         .ok_or(NavigationError::Level(fix.stamp))?;
@@ -372,25 +382,30 @@ fn initial_belief(
 /// Distances of withheld fixes from their predictions, by outage.
 #[derive(Default)]
 struct OutageErrors {
-    /// Number of the outage, start, distances.
-    outages: Vec<(usize, f64, Vec<f64>)>,
+    /// Number of the outage, start, distances and their normalized squares.
+    outages: Vec<(usize, f64, Vec<(f64, f64)>)>,
 }
 
 impl OutageErrors {
-    fn add(&mut self, number: usize, elapsed: f64, distance: f64) {
+    fn add(&mut self, number: usize, elapsed: f64, innovation: &Innovation) {
+        let error = (innovation.residual.norm(), innovation.nis);
         match self.outages.last_mut() {
-            Some((last, _, distances)) if *last == number => distances.push(distance),
-            _ => self.outages.push((number, elapsed, vec![distance])),
+            Some((last, _, errors)) if *last == number => errors.push(error),
+            _ => self.outages.push((number, elapsed, vec![error])),
         }
     }
 
     fn reports(&self) -> Vec<OutageReport> {
-        let report = |(_, start, distances): &(usize, f64, Vec<f64>)| OutageReport {
-            start: *start,
-            fixes: distances.len(),
-            rms: (distances.iter().map(|d| d * d).sum::<f64>() / distances.len() as f64).sqrt(),
-            max: distances.iter().copied().fold(0.0, f64::max),
-            last: distances.last().copied().unwrap_or_default(),
+        let report = |(_, start, errors): &(usize, f64, Vec<(f64, f64)>)| {
+            let mean = |sum: f64| sum / errors.len() as f64;
+            OutageReport {
+                start: *start,
+                fixes: errors.len(),
+                rms: mean(errors.iter().map(|(distance, _)| distance * distance).sum()).sqrt(),
+                nis: mean(errors.iter().map(|(_, nis)| nis).sum()),
+                max: errors.iter().map(|(distance, _)| *distance).fold(0.0, f64::max),
+                last: errors.last().map_or(0.0, |(distance, _)| *distance),
+            }
         };
         self.outages.iter().map(report).collect()
     }

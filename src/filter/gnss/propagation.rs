@@ -30,6 +30,9 @@ pub(super) struct MomentPropagator {
     accel_noise: f64,
     gyro_bias_walk: f64,
     accel_bias_walk: f64,
+    gap_gyro_noise: f64,
+    gap_accel_noise: f64,
+    in_gap: bool,
 }
 
 /// Moments after a step, in the principal axes before it.
@@ -47,6 +50,22 @@ impl MomentPropagator {
             accel_noise: imu.accel_noise,
             gyro_bias_walk: imu.gyro_bias_walk,
             accel_bias_walk: imu.accel_bias_walk,
+            gap_gyro_noise: imu.gap_gyro_noise,
+            gap_accel_noise: imu.gap_accel_noise,
+            in_gap: false,
+        }
+    }
+
+    pub fn set_imu_gap(&mut self, in_gap: bool) {
+        self.in_gap = in_gap;
+    }
+
+    /// White noise of gyroscope and accelerometer.
+    fn white(&self) -> (f64, f64) {
+        if self.in_gap {
+            (self.gap_gyro_noise, self.gap_accel_noise)
+        } else {
+            (self.gyro_noise, self.accel_noise)
         }
     }
 
@@ -110,7 +129,8 @@ impl MomentPropagator {
         let bias_covariance = conditional.fixed_view::<3, 3>(GYRO_BIAS, GYRO_BIAS).into_owned();
 
         // q' = affine + bilinear + noise.
-        let noise = self.gyro_noise.powi(2) * h;
+        let (gyro_noise, _) = self.white();
+        let noise = gyro_noise.powi(2) * h;
         let shrink = mean_of_noise(noise);
         let turned_mean = SMatrix::<f64, 9, 3>::from_columns(&[
             turned(0, &central.mean),
@@ -185,7 +205,8 @@ impl MomentPropagator {
 
     /// Covariance that white noises add to the Euclidean state over a step.
     fn noise(&self, h: f64) -> EuclideanCovariance {
-        let accel = self.accel_noise.powi(2);
+        let (_, accel_noise) = self.white();
+        let accel = accel_noise.powi(2);
         let mut q = EuclideanCovariance::zeros();
         for k in 0..3 {
             let (v, p) = (VELOCITY + k, POSITION + k);
