@@ -167,6 +167,41 @@ fn a_wrong_fix_is_rejected_and_a_lasting_jump_accepted() {
     assert!(fates[80..].iter().all(|fate| fate == "used"), "{fates:?}");
 }
 
+/// Samples within a stretch replaced by interpolation are no evidence.
+#[test]
+fn a_gap_that_was_filled_in_is_found_and_bridged() {
+    let drive = drive(90);
+    let table = lines(&drive.imu);
+    let mut rows: Vec<Vec<f64>> = table[1..]
+        .iter()
+        .map(|line| line.split(',').map(|x| x.parse().unwrap()).collect())
+        .collect();
+    let (first, last) = (6000, 6700);
+    for k in first + 1..last {
+        let share = (k - first) as f64 / (last - first) as f64;
+        for column in 1..7 {
+            rows[k][column] = rows[first][column] * (1.0 - share) + rows[last][column] * share;
+        }
+    }
+    let texts: Vec<String> = rows
+        .iter()
+        .map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(","))
+        .collect();
+    std::fs::write(&drive.imu, format!("{}\n{}\n", table[0], texts.join("\n"))).unwrap();
+    for filter in ["mfgi", "mfgb"] {
+        let run = |more: &[&str]| {
+            let more = [&SETTINGS[..], more, &["--json"]].concat();
+            json(&arguments(&drive.imu, &drive.gps, filter, &more))
+        };
+        let bridged = run(&[]);
+        assert_eq!([&bridged["gaps"], &bridged["interpolated"]], [0, 1]);
+        let believed = run(&["--set", "imu.max_gap=10"]);
+        assert_eq!(believed["interpolated"], 0);
+        let mean = |report: &serde_json::Value| report["nis"]["mean"].as_f64().unwrap();
+        assert!(mean(&bridged) < 4.0 && mean(&believed) > 6.0, "{bridged} {believed}");
+    }
+}
+
 #[test]
 fn a_known_heading_needs_no_convergence() {
     let drive = drive(30);
@@ -214,7 +249,9 @@ fn kitti_heading_agrees_with_the_course() {
     let out = tempfile::tempdir().unwrap();
     let more = ["--out", text(out.path()), "--json"];
     let report = json(&arguments(&imu, &gps, "mfgi", &more));
-    assert_eq!(report["gaps"], 0);
+    assert_eq!([&report["gaps"], &report["interpolated"]], [0, 8]);
+    let mean = report["nis"]["mean"].as_f64().unwrap();
+    assert!(mean > 2.0 && mean < 3.5, "{mean}");
     let converged = report["heading_converged_s"].as_f64().expect("a time");
     assert!(converged < 60.0, "{converged}");
     let names = ["time", "vel_x", "vel_y", "qx", "qy", "qz", "qw"];
