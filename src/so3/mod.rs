@@ -68,6 +68,7 @@ pub use exponential::{
     right_jacobian_inverse, vee,
 };
 pub use haar::{HaarQuadrature, sample_haar};
+pub(crate) use polar::cofactors;
 pub use polar::proper_polar;
 pub use principal_axes::principal_axes;
 pub use proper_svd::{NotFinite, ProperSvd, project_to_so3, proper_svd};

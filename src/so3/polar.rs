@@ -2,11 +2,12 @@ use nalgebra::{Matrix3, Rotation3};
 
 use super::proper_svd::{NotFinite, proper_svd};
 
-/// Newton steps for the largest eigenvalue; it converges from above, quadratically.
+/// Halley steps for the largest eigenvalue; as all roots are real they converge from above, and the
+/// error is that before to the third power.
 const MAX_STEPS: usize = 20;
-/// Relative step after which the eigenvalue counts as found: what is left is its square, times at
-/// most `0.75/CONDITION`.
-const CONVERGED: f64 = 1e-9;
+/// Relative step after which the eigenvalue counts as found: what is left is its third power, times
+/// at most `(0.75/CONDITION)^2`.
+const CONVERGED: f64 = 1e-7;
 /// Smallest `(s1 + s2)(s2 + s3)(s1 + s3)` relative to `(tr S)^3` for which the closed form is
 /// used.
 const CONDITION: f64 = 1e-3;
@@ -26,22 +27,42 @@ pub fn proper_polar(m: &Matrix3<f64>) -> Result<(Rotation3<f64>, Matrix3<f64>), 
     Ok((rotation, 0.5 * (k + k.transpose())))
 }
 
+/// The cofactors of a matrix: its determinant times the transpose of its inverse.
+pub(crate) fn cofactors(m: &Matrix3<f64>) -> Matrix3<f64> {
+    let minor = |i: usize, j: usize| {
+        let (a, b, c, d) = ((i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3);
+        m[(a, c)] * m[(b, d)] - m[(a, d)] * m[(b, c)]
+    };
+    Matrix3::new(
+        minor(0, 0),
+        minor(0, 1),
+        minor(0, 2),
+        minor(1, 0),
+        minor(1, 1),
+        minor(1, 2),
+        minor(2, 0),
+        minor(2, 1),
+        minor(2, 2),
+    )
+}
+
 fn closed_form(m: &Matrix3<f64>) -> Option<Rotation3<f64>> {
     let scale = m.amax();
     if !(scale > 0.0 && scale.is_finite()) {
         return None;
     }
-    let b = m / scale;
-    let (x, y, z) = (b.column(0), b.column(1), b.column(2));
-    let cofactors = Matrix3::from_columns(&[y.cross(&z), z.cross(&x), x.cross(&y)]);
-    let (squared, determinant) = (b.norm_squared(), x.dot(&cofactors.column(0)));
+    let b = m * scale.recip();
+    let cofactors = cofactors(&b);
+    let (squared, determinant) = (b.norm_squared(), b.column(0).dot(&cofactors.column(0)));
     let minors = cofactors.norm_squared();
     // tr S is the largest root of (l^2 - |b|^2)^2 - 8 l det b - 4 |cof b|^2.
     let mut l = (3.0 * squared).sqrt();
     let converged = (0..MAX_STEPS).any(|_| {
         let excess = l * l - squared;
         let value = excess * excess - 8.0 * l * determinant - 4.0 * minors;
-        let step = value / (4.0 * l * excess - 8.0 * determinant);
+        let slope = 4.0 * l * excess - 8.0 * determinant;
+        let half_bend = 2.0 * (excess + 2.0 * l * l);
+        let step = value * slope / (slope * slope - value * half_bend);
         l -= step;
         // Not a number where the slope vanishes: then never converged.
         step.abs() <= CONVERGED * l
@@ -51,7 +72,7 @@ fn closed_form(m: &Matrix3<f64>) -> Option<Rotation3<f64>> {
     if !(converged && zeta > CONDITION * l * l * l) {
         return None;
     }
-    let r = (b * (kappa + squared) + cofactors * l - b * (b.transpose() * b)) / zeta;
+    let r = (b * (kappa + squared) + cofactors * l - b * (b.transpose() * b)) * zeta.recip();
     // Restores orthogonality to rounding.
     let r = r * (Matrix3::from_diagonal_element(1.5) - 0.5 * (r.transpose() * r));
     Some(Rotation3::from_matrix_unchecked(r))

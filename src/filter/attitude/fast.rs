@@ -8,7 +8,7 @@ use super::super::bayes::{
 use super::invariant::conjugated;
 use super::{GyroModel, gaussian_covariance, information_of};
 use crate::distribution::matrix_fisher::MatrixFisher;
-use crate::so3::{exp, hat, proper_polar};
+use crate::so3::{cofactors, exp, hat, proper_polar};
 
 /// Concentration, relative to the others, below which an axis of the solution of Wahba's problem
 /// counts as unknown.
@@ -20,10 +20,11 @@ const LEAST_INFORMATION: f64 = 1e-9;
 /// error, and whose posterior is Bayes' rule on SO(3).
 ///
 /// The covariance is carried between measurements and the parameter formed only for Bayes' rule,
-/// by (31); polar decompositions, no singular values. It is that of the body-frame error for both
-/// filters, `P_R = R P_L R^T`: all that tells them apart is when the noise enters, (37) before the
-/// turn and (49) after it, and only anisotropic noise knows the difference. Vectors of any length with any covariance
-/// are admissible; weights in Wahba's problem are the inverse mean variances. Where that problem
+/// by (31); polar decompositions, no singular values. It is the same for both filters, as
+/// `P_R = R P_L R^T`: all that tells them apart is when the noise enters, (37) before the turn and
+/// (49) after it, and only anisotropic noise knows the difference. It is resolved in the frame in
+/// which the turns that the gyroscope measures leave it alone, the world for a gyroscope of the
+/// body's rate. Vectors of any length with any covariance are admissible; weights in Wahba's problem are the inverse mean variances. Where that problem
 /// has no unique solution (a single direction) the likelihood is that of the direction, as in
 /// W22 (4.14).
 #[derive(Debug, Clone, Copy)]
@@ -33,21 +34,38 @@ pub struct FastNonlinear {
     error: Frame,
     gyro: GyroModel,
     mode: Rotation3<f64>,
-    /// Covariance of the error in the body frame, rad^2.
+    /// Covariance of the error in the frame that is not the gyroscope's, rad^2.
     covariance: Matrix3<f64>,
 }
 
 impl FastNonlinear {
     /// The filter that starts from `prior` with its error in the frame `error`.
     pub fn new(error: Frame, gyro: &GyroModel, prior: &MatrixFisher) -> Self {
-        let covariance = covariance_of(&prior.information(), || gaussian_covariance(prior));
-        Self { error, gyro: *gyro, mode: prior.mode(), covariance }
+        let in_body = covariance_of(&prior.information(), || gaussian_covariance(prior));
+        let mode = prior.mode();
+        Self { error, gyro: *gyro, mode, covariance: carried(gyro.frame, &mode, &in_body) }
+    }
+
+    /// Parameter of the belief: `R N` with (31) of the covariance in the body frame, `N R` in the
+    /// world frame.
+    fn parameter(&self) -> Result<Matrix3<f64>, FilterError> {
+        let n = parameter_of_covariance(&self.covariance)?;
+        Ok(match self.gyro.frame {
+            Frame::Body => n * self.mode.matrix(),
+            Frame::World => self.mode.matrix() * n,
+        })
+    }
+
+    fn covariance_in_body(&self) -> Matrix3<f64> {
+        match self.gyro.frame {
+            Frame::Body => conjugated(&self.mode.inverse(), &self.covariance),
+            Frame::World => self.covariance,
+        }
     }
 
     /// Bayes' rule with the likelihood `exp(tr(added^T R))`.
     fn fuse(&mut self, added: &Matrix3<f64>) -> Result<(), FilterError> {
-        let prior = self.mode.matrix() * parameter_of_covariance(&self.covariance)?;
-        let (mode, k) = proper_polar(&(prior + added))?;
+        let (mode, k) = proper_polar(&(self.parameter()? + added))?;
         let information = information_of(&k);
         let covariance = covariance_of(&information, || {
             let eigen = information.symmetric_eigen();
@@ -55,32 +73,22 @@ impl FastNonlinear {
             eigen.eigenvectors * Matrix3::from_diagonal(&variance) * eigen.eigenvectors.transpose()
         });
         super::finite("posterior", covariance.as_slice())?;
-        (self.mode, self.covariance) = (mode, covariance);
+        (self.mode, self.covariance) = (mode, carried(self.gyro.frame, &mode, &covariance));
         Ok(())
     }
 
     /// The covariance after a turn by which the attitude becomes `next`, and the noise of it.
-    fn propagated(
-        &self,
-        turn: &Rotation3<f64>,
-        next: &Rotation3<f64>,
-        seconds: f64,
-    ) -> Matrix3<f64> {
-        let back = turn.inverse();
-        let turned = |p: &Matrix3<f64>| match self.gyro.frame {
-            Frame::Body => conjugated(&back, p),
-            Frame::World => *p,
-        };
+    fn propagated(&self, next: &Rotation3<f64>, seconds: f64) -> Matrix3<f64> {
         if let Some(variance) = self.gyro.isotropic_variance(seconds) {
-            return turned(&self.covariance) + Matrix3::from_diagonal_element(variance);
+            return self.covariance + Matrix3::from_diagonal_element(variance);
         }
         let q = self.gyro.noise * seconds;
-        match (self.error, self.gyro.frame) {
-            (Frame::World, Frame::Body) => turned(&(self.covariance + q)),
-            (Frame::Body, Frame::Body) => turned(&self.covariance) + q,
-            (Frame::World, Frame::World) => self.covariance + conjugated(&next.inverse(), &q),
-            (Frame::Body, Frame::World) => self.covariance + conjugated(&self.mode.inverse(), &q),
-        }
+        let entered = if self.error == self.gyro.frame { next } else { &self.mode };
+        self.covariance
+            + match self.gyro.frame {
+                Frame::Body => conjugated(entered, &q),
+                Frame::World => conjugated(&entered.inverse(), &q),
+            }
     }
 
     /// The parameter of the likelihood of `measured` by the linearised Wahba problem, (44)/(51).
@@ -91,9 +99,10 @@ impl FastNonlinear {
             profile += m.in_world * m.in_body.transpose() * weight(m);
         }
         let (solution, k) = proper_polar(&profile)?;
-        let Some(inverse) = inverse_of_symmetric(&information_of(&k), UNSOLVABLE) else {
+        let bend = information_of(&k);
+        if bend.determinant() <= UNSOLVABLE * bend.trace().powi(3) {
             return VectorMeasurement::joint_parameter(measured);
-        };
+        }
         let mut gradient = Matrix3::zeros();
         for m in measured {
             let known_in_body = match m.measured_in {
@@ -107,8 +116,18 @@ impl FastNonlinear {
             let slope = hat(&known_in_body) * weight(m);
             gradient += slope * noise_in_body * slope.transpose();
         }
-        let covariance = inverse * gradient * inverse;
-        Ok(solution.matrix() * parameter_of_covariance(&covariance)?)
+        // The solution's covariance is `bend^-1 gradient bend^-1`.
+        let weight = inverse_of_symmetric(&gradient, 0.0)
+            .ok_or(FilterError::NotPositive("measurement covariance"))?;
+        Ok(solution.matrix() * parameter_of_information(&(bend * weight * bend)))
+    }
+}
+
+/// A covariance resolved in the body frame, in the frame that is not the gyroscope's.
+fn carried(gyro: Frame, mode: &Rotation3<f64>, in_body: &Matrix3<f64>) -> Matrix3<f64> {
+    match gyro {
+        Frame::Body => conjugated(mode, in_body),
+        Frame::World => *in_body,
     }
 }
 
@@ -119,14 +138,17 @@ fn weight(m: &VectorMeasurement) -> f64 {
 /// `N = tr(P^-1)/2 I - P^-1` (31).
 fn parameter_of_covariance(p: &Matrix3<f64>) -> Result<Matrix3<f64>, FilterError> {
     let information = inverse_of_symmetric(p, 0.0).ok_or(FilterError::NotPositive("covariance"))?;
-    Ok(Matrix3::from_diagonal_element(0.5 * information.trace()) - information)
+    Ok(parameter_of_information(&information))
+}
+
+fn parameter_of_information(information: &Matrix3<f64>) -> Matrix3<f64> {
+    Matrix3::from_diagonal_element(0.5 * information.trace()) - information
 }
 
 /// The inverse of a symmetric matrix whose determinant exceeds `least` times the cube of its trace.
 fn inverse_of_symmetric(m: &Matrix3<f64>, least: f64) -> Option<Matrix3<f64>> {
-    let (x, y, z) = (m.column(0), m.column(1), m.column(2));
-    let cofactors = Matrix3::from_columns(&[y.cross(&z), z.cross(&x), x.cross(&y)]);
-    let determinant = x.dot(&cofactors.column(0));
+    let cofactors = cofactors(m);
+    let determinant = m.column(0).dot(&cofactors.column(0));
     let inverse = cofactors * determinant.recip();
     (determinant > least * m.trace().powi(3)).then_some(inverse)
 }
@@ -156,7 +178,7 @@ impl BayesFilter for FastNonlinear {
             Frame::Body => self.mode * turn,
             Frame::World => turn * self.mode,
         };
-        self.covariance = self.propagated(&turn, &next, step.seconds);
+        self.covariance = self.propagated(&next, step.seconds);
         self.mode = next;
         Ok(())
     }
@@ -176,11 +198,12 @@ impl BayesFilter for FastNonlinear {
     }
 
     fn estimate(&self) -> Estimate {
-        let information = self.covariance.try_inverse();
+        let in_body = self.covariance_in_body();
+        let information = in_body.try_inverse();
         let fisher =
             information.and_then(|h| MatrixFisher::from_mode_and_information(self.mode, h).ok());
         fisher.map_or_else(
-            || Estimate::of_attitude(self.mode, self.covariance),
+            || Estimate::of_attitude(self.mode, in_body),
             |fisher| Estimate::of_matrix_fisher(&fisher),
         )
     }
