@@ -1,39 +1,18 @@
 //! A step and an update of each IMU-GNSS filter, with a 3x3 singular value decomposition in the
 //! same run as the unit: `cargo bench --bench gnss --no-default-features`.
 
+#[path = "../tests/support/navigation.rs"]
+mod navigation;
+
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use mfg_vio::filter::gnss::{AttitudeUpdate, GnssFilter, GnssFilterKind, InitialBelief};
-use mfg_vio::filter::{InertialStep, PositionMeasurement};
-use mfg_vio::inertial::{ImuConfig, NavState};
+use mfg_vio::filter::PositionMeasurement;
+use mfg_vio::filter::gnss::{AttitudeUpdate, GnssFilter, GnssFilterKind};
+use mfg_vio::inertial::ImuConfig;
 use mfg_vio::so3::{exp, proper_svd};
-use nalgebra::{Isometry3, Matrix3, Vector3};
-
-fn initial(heading_sd: Option<f64>) -> InitialBelief {
-    InitialBelief {
-        state: NavState {
-            world_from_body: Isometry3::rotation(Vector3::new(0.1, 0.2, 1.0)),
-            velocity: Vector3::new(5.0, 3.0, 0.0),
-            gyro_bias: Vector3::zeros(),
-            accel_bias: Vector3::zeros(),
-        },
-        tilt_sd: 0.01,
-        heading_sd,
-        velocity_sd: 1.0,
-        position_sd: 1.0,
-        gyro_bias_sd: 1e-3,
-        accel_bias_sd: 1e-2,
-    }
-}
-
-fn step() -> InertialStep {
-    InertialStep {
-        seconds: 0.01,
-        angular_velocity: Vector3::new(0.1, -0.05, 0.3),
-        specific_force: Some(Vector3::new(0.5, 1.0, 9.8)),
-    }
-}
+use nalgebra::{Matrix3, Vector3};
+use navigation::{initial, step};
 
 /// Each filter after a second, its attitude concentrated or its heading unknown.
 fn filters() -> Vec<(String, Box<dyn GnssFilter>)> {

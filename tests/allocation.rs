@@ -1,5 +1,8 @@
 //! Steps that run at the rate of the sensors do not allocate.
 
+#[path = "support/navigation.rs"]
+mod navigation;
+
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::hint::black_box;
@@ -10,11 +13,12 @@ use mfg_vio::distribution::matrix_fisher::{
 };
 use mfg_vio::distribution::matrix_fisher_gaussian::{Correlation, MatrixFisherGaussian};
 use mfg_vio::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
-use mfg_vio::filter::gnss::{AttitudeUpdate, GnssFilterKind, InitialBelief};
-use mfg_vio::filter::{FilterConfig, FilterKind, InertialStep};
+use mfg_vio::filter::gnss::{AttitudeUpdate, GnssFilterKind};
+use mfg_vio::filter::{FilterConfig, FilterKind};
 use mfg_vio::inertial::{Belief, ImuConfig, ImuSample, NavCovariance, NavState, Propagator, Stamp};
 use mfg_vio::so3::{exp, log, proper_svd};
 use nalgebra::{Const, Isometry3, Matrix3, OMatrix, OVector, Rotation3, U3, Vector3};
+use navigation::{initial, step};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::Distribution;
@@ -92,11 +96,7 @@ fn updates_and_imu_steps_of_every_filter_do_not_allocate() {
 /// Unscented filters make a list of their sigma points.
 #[test]
 fn steps_of_attitude_and_navigation_filters_do_not_allocate() {
-    let step = InertialStep {
-        seconds: 0.01,
-        angular_velocity: Vector3::new(0.1, -0.05, 0.3),
-        specific_force: Some(Vector3::new(0.5, 1.0, 9.8)),
-    };
+    let step = step();
     let prior = AttitudePrior::matrix_fisher(&Matrix3::from_diagonal_element(30.0)).unwrap();
     let gyro = GyroModel::isotropic(0.01, 1e-4);
     let unscented = [AttitudeFilterKind::Mfgiu, AttitudeFilterKind::Mfgbu];
@@ -107,20 +107,7 @@ fn steps_of_attitude_and_navigation_filters_do_not_allocate() {
         assert_eq!(allocations(|| filter.propagate(&step).unwrap()), 0, "{kind}");
     }
     for heading_sd in [None, Some(0.01)] {
-        let initial = InitialBelief {
-            state: NavState {
-                world_from_body: Isometry3::rotation(Vector3::new(0.1, 0.2, 1.0)),
-                velocity: Vector3::new(5.0, 3.0, 0.0),
-                gyro_bias: Vector3::zeros(),
-                accel_bias: Vector3::zeros(),
-            },
-            tilt_sd: 0.01,
-            heading_sd,
-            velocity_sd: 1.0,
-            position_sd: 1.0,
-            gyro_bias_sd: 1e-3,
-            accel_bias_sd: 1e-2,
-        };
+        let initial = initial(heading_sd);
         for kind in GnssFilterKind::ALL {
             let imu = ImuConfig::default();
             let mut filter = kind.start(&imu, AttitudeUpdate::Flow, &initial).unwrap();
