@@ -50,11 +50,13 @@ fn decorrelate(
         return false;
     }
     let zeta = (second - first) / (2.0 * product);
-    let tangent = zeta.signum() / (zeta.abs() + (1.0 + zeta * zeta).sqrt());
+    let root = (1.0 + zeta * zeta).sqrt();
+    let tangent = zeta.signum() / (zeta.abs() + root);
     if tangent == 0.0 {
         return false;
     }
-    let cosine = 1.0 / (1.0 + tangent * tangent).sqrt();
+    // `1/sqrt(1 + tangent^2)`, without waiting for the tangent.
+    let cosine = ((root + zeta.abs()) / (2.0 * root)).sqrt();
     let sine = cosine * tangent;
     (m[(p, p)], m[(q, q)]) = (first - tangent * product, second + tangent * product);
     (m[(p, q)], m[(q, p)]) = (0.0, 0.0);
