@@ -20,10 +20,12 @@ const BATCH: usize = 16;
 /// What the Euclidean part is regressed on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Coordinates {
-    /// On the rotation matrix: a world vector is `y = R R^T_hat y_hat + B r + noise`,
-    /// `r = vec(R)`, with a matrix Fisher density of `R`. A common turn of body and map is
-    /// `R -> G R`, under which this form keeps its parameters: turning what cannot be observed
-    /// changes nothing that is measured.
+    /// On the group of common turns and moves: with `R = exp(t^) R_hat` a world vector is
+    /// `y = exp(t^) y_hat + J(t) (B t + noise)`, `J` the left Jacobian of SO(3), with a matrix
+    /// Fisher density of `R` and the sine of `t` in place of it. A common turn of body and map is
+    /// `t` alone, under which this form keeps its parameters: turning what cannot be observed
+    /// changes nothing that is measured. A vector that does not turn with the body has
+    /// `B t = y_hat x t` and, by `J(t) t^ = exp(t^) - I`, stays exactly where it is.
     Group,
     /// On the rotation vector at the estimate, as an extended Kalman filter does:
     /// `y = y_hat + B e + noise`.
@@ -57,11 +59,11 @@ pub(super) enum Target {
 /// `x = x_0(R) + slope y + noise(covariance)`, `-2 log p(R) = -2 log p_0(R) + y^T evidence y`.
 ///
 /// `x_0` is that of [`Coordinates`]. A point measured at `p'` has the residual
-/// `R p' + p - l = R q + (p - p_0(R)) - (l - l_0(R))`, where `q` is the residual at the estimate
-/// in body coordinates. As its covariance `A` turns with the body, `R q` is weighed by
-/// `R A^-1 R^T` and says nothing about `R`: in the evidence it stands at the estimate, and what it
-/// moves in `x` turns with `R`. (Turning `R q` under a weight that does not turn would add
-/// information about `R` with every anisotropic measurement, whatever is measured.)
+/// `R p' + p - l = exp(t^) (q + J(t)^T (u_p - u_l))`, `u = B t + noise`, where `q` is the residual at
+/// the estimate. As its covariance `A` turns with the body, it is weighed with `R` at the estimate
+/// and without the first factor, and `q` says nothing about `R`. (Turning it under a weight that
+/// does not turn would add information about `R` with every anisotropic measurement, whatever is
+/// measured.) What `J(t)` adds is of second order, and taken from an [`Expansion`].
 pub(super) struct Regression<'a> {
     coordinates: Coordinates,
     prior: &'a Rotation3<f64>,
@@ -75,12 +77,27 @@ pub(super) struct Regression<'a> {
     evidence: DMatrix<f64>,
 }
 
+/// Where terms of second order are taken from: what an update came to.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Expansion {
+    pub mode: Rotation3<f64>,
+    /// `u` of the blocks of the Euclidean part.
+    moved: Vec<Vector3<f64>>,
+}
+
+impl Expansion {
+    /// The prediction, where there are none.
+    pub fn of_prior(prior: &Rotation3<f64>, blocks: usize) -> Self {
+        Self { mode: *prior, moved: vec![Vector3::zeros(); blocks] }
+    }
+}
+
 /// Mode of the rotation, the Euclidean part there, and the covariance of (body-frame rotation
 /// error, Euclidean part).
 pub(super) struct Posterior {
-    pub mode: Rotation3<f64>,
     pub means: Vec<Vector3<f64>>,
     pub covariance: DMatrix<f64>,
+    pub expansion: Expansion,
 }
 
 impl<'a> Regression<'a> {
@@ -140,37 +157,36 @@ impl<'a> Regression<'a> {
     pub fn squared_distances(&self, measurements: &[Measurement]) -> Option<Vec<f64>> {
         let at_prior = self.coordinates.at_prior();
         let derivative = self.coordinates.derivative(self.prior);
+        let expansion = Expansion::of_prior(self.prior, self.prior_means.len());
         measurements
             .iter()
-            .map(|m| Some(self.noise(m, self.prior, 0.0, &at_prior, &derivative)?.1))
+            .map(|m| Some(self.noise(m, &expansion, 0.0, &at_prior, &derivative)?.1))
             .collect()
     }
 
-    /// Bayes' rule. Covariances are
-    /// turned to the world by `weighted_at`, and inflated so that weights fall by Huber's law
+    /// Bayes' rule, with terms of second order and the attitude by which noise is turned to the
+    /// world taken from `expansion`. Covariances are inflated so that weights fall by Huber's law
     /// beyond a Mahalanobis distance of `huber` (0: never). Gives the squared normalised
     /// innovation per degree of freedom.
     pub fn condition(
         &mut self,
         measurements: &[Measurement],
-        weighted_at: &Rotation3<f64>,
+        expansion: &Expansion,
         huber: f64,
     ) -> Option<f64> {
         let at_prior = self.coordinates.at_prior();
         let derivative = self.coordinates.derivative(self.prior);
         let noises: Vec<_> = measurements
             .iter()
-            .map(|m| Some(self.noise(m, weighted_at, huber, &at_prior, &derivative)?.0))
+            .map(|m| Some(self.noise(m, expansion, huber, &at_prior, &derivative)?.0))
             .collect::<Option<_>>()?;
         for (batch, noises) in measurements.chunks(BATCH).zip(noises.chunks(BATCH)) {
-            self.condition_batch(batch, noises)?;
+            self.condition_batch(batch, noises, expansion)?;
         }
 
         let total = (at_prior.transpose() * &self.evidence * &at_prior)[(0, 0)];
         let gradient = derivative.transpose() * &self.evidence * &at_prior;
-        let information = derivative.transpose() * &self.evidence * &derivative;
-        let information = self.rotation_information + information.fixed_view::<3, 3>(0, 0);
-        let explained = information.cholesky()?.solve(&gradient.fixed_view::<3, 1>(0, 0));
+        let explained = self.information().cholesky()?.solve(&gradient.fixed_view::<3, 1>(0, 0));
         let explained = gradient.fixed_view::<3, 1>(0, 0).dot(&explained);
         Some((total - explained).max(0.0) / (3.0 * measurements.len() as f64))
     }
@@ -180,17 +196,20 @@ impl<'a> Regression<'a> {
     fn noise(
         &self,
         measurement: &Measurement,
-        weighted_at: &Rotation3<f64>,
+        expansion: &Expansion,
         huber: f64,
         at_prior: &DMatrix<f64>,
         derivative: &DMatrix<f64>,
     ) -> Option<(Matrix3<f64>, f64)> {
-        let turn = weighted_at.matrix();
+        let turn = match (self.coordinates, measurement.target) {
+            (Coordinates::Group, Target::State { .. }) => self.prior.matrix(),
+            _ => expansion.mode.matrix(),
+        };
         let mut noise = turn * measurement.body_covariance * turn.transpose();
         if let Target::Known { covariance, .. } = measurement.target {
             noise += covariance;
         }
-        let rows = self.design(measurement);
+        let rows = self.design(measurement, expansion);
         let residual = (&rows * at_prior).fixed_view::<3, 1>(0, 0).into_owned();
         let by_rotation = (rows * derivative).fixed_view::<3, 3>(0, 0).into_owned();
         let mut cross = DMatrix::zeros(self.covariance.nrows(), 3);
@@ -207,7 +226,7 @@ impl<'a> Regression<'a> {
     }
 
     /// Derivative by `y` of the residual `R p' + p - l`, the regression of `x` included (3 x c).
-    fn design(&self, measurement: &Measurement) -> DMatrix<f64> {
+    fn design(&self, measurement: &Measurement, expansion: &Expansion) -> DMatrix<f64> {
         let position = self.prior_means[POSITION];
         let mut rows = self.slope.rows(3 * POSITION, 3).into_owned();
         let target = match measurement.target {
@@ -238,7 +257,24 @@ impl<'a> Regression<'a> {
         }
         let mut column = rows.fixed_view_mut::<3, 1>(0, last);
         column += self.prior * (measurement.in_body - expected);
+        column += self.second_order(measurement, expansion);
         rows
+    }
+
+    /// What the residual has beyond its linear terms.
+    fn second_order(&self, measurement: &Measurement, expansion: &Expansion) -> Vector3<f64> {
+        let turn = so3::log(&(expansion.mode * self.prior.inverse()));
+        let position = expansion.moved[POSITION];
+        match (self.coordinates, measurement.target) {
+            (Coordinates::Additive, _) => Vector3::zeros(),
+            (Coordinates::Group, Target::State { block }) => {
+                let moved = position - expansion.moved[block];
+                so3::right_jacobian(&turn) * moved - moved
+            }
+            (Coordinates::Group, Target::Known { .. }) => {
+                so3::left_jacobian(&turn) * position - position
+            }
+        }
     }
 
     /// Adds the covariance of `x` given the rotation with the residual of a measurement (n x 3).
@@ -263,14 +299,19 @@ impl<'a> Regression<'a> {
         }
     }
 
-    fn condition_batch(&mut self, batch: &[Measurement], noises: &[Matrix3<f64>]) -> Option<()> {
+    fn condition_batch(
+        &mut self,
+        batch: &[Measurement],
+        noises: &[Matrix3<f64>],
+        expansion: &Expansion,
+    ) -> Option<()> {
         let (n, m) = (self.covariance.ncols(), 3 * batch.len());
         // Covariance of x and the innovations, columns of which are contiguous.
         let mut cross = DMatrix::zeros(n, m);
         let mut design = DMatrix::zeros(m, self.coordinates.size());
         for (i, measurement) in batch.iter().enumerate() {
             self.add_cross(measurement, &mut cross.columns_mut(3 * i, 3));
-            design.rows_mut(3 * i, 3).copy_from(&self.design(measurement));
+            design.rows_mut(3 * i, 3).copy_from(&self.design(measurement, expansion));
         }
         let mut innovation = DMatrix::zeros(m, m);
         for (i, (measurement, noise)) in batch.iter().zip(noises).enumerate() {
@@ -296,33 +337,51 @@ impl<'a> Regression<'a> {
         Some(())
     }
 
-    /// The concentrated belief with this density's mode and curvature.
+    /// Information about the body-frame rotation error, at the estimate.
+    fn information(&self) -> Matrix3<f64> {
+        let derivative = self.coordinates.derivative(self.prior);
+        let evidence = derivative.transpose() * &self.evidence * &derivative;
+        self.rotation_information + evidence.fixed_view::<3, 3>(0, 0)
+    }
+
+    /// The concentrated belief around this density's mode.
+    ///
+    /// Errors of the posterior are taken for those of the prediction, in the group's coordinates:
+    /// what cannot be observed is then the same before and after, whatever the update corrects.
+    /// (The derivatives at the mode would mix it with the rest by terms of second order, which
+    /// after a few updates is information about the heading.)
     pub fn posterior(self) -> Option<Posterior> {
-        let (mode, information) = match self.coordinates {
-            Coordinates::Group => self.rotation_density().mode(self.prior)?,
+        let mode = match self.coordinates {
+            Coordinates::Group => self.rotation_density().mode(self.prior)?.0,
             Coordinates::Additive => self.additive_mode()?,
         };
-        let rotation_covariance = information.cholesky()?.inverse();
-        let last = self.coordinates.size() - 1;
-        let shift = self.slope.column(last).into_owned();
-        let slope = self.slope.columns(0, last);
-        let moved = match self.coordinates {
-            Coordinates::Group => {
-                slope * (vectorize(mode.matrix()) - vectorize(self.prior.matrix()))
-            }
-            Coordinates::Additive => slope * so3::log(&(self.prior.inverse() * mode)),
+        // Body coordinates of the mode to those of the estimate, by way of the world where the
+        // error is the group's.
+        let error = match self.coordinates {
+            Coordinates::Group => self.prior.inverse() * mode,
+            Coordinates::Additive => Rotation3::identity(),
         };
-        let mut by_rotation = slope * self.coordinates.derivative(&mode).rows(0, last);
+        let inverse = self.information().cholesky()?.inverse();
+        let rotation_covariance = error.matrix().transpose() * inverse * error.matrix();
+        let last = self.coordinates.size() - 1;
+        let slope = &self.slope * self.coordinates.derivative(self.prior);
+        let turn = so3::log(&(self.prior.inverse() * mode));
+        let displacement = self.slope.column(last) + &slope * turn;
+        let left_jacobian = so3::left_jacobian(&(self.prior * turn));
+
+        let mut by_rotation = slope * error.matrix();
         let mut means = self.prior_means.to_vec();
+        let mut moved = Vec::with_capacity(means.len());
         for (k, mean) in means.iter_mut().enumerate() {
-            *mean += shift.fixed_rows::<3>(3 * k);
+            let by = displacement.fixed_rows::<3>(3 * k).into_owned();
+            moved.push(by);
             if self.turns(k) {
-                let in_body = self.prior.inverse() * *mean;
-                *mean = mode * in_body;
+                *mean = mode * (self.prior.inverse() * *mean) + left_jacobian * by;
                 let mut rows = by_rotation.fixed_view_mut::<3, 3>(3 * k, 0);
-                rows -= mode.matrix() * in_body.cross_matrix();
+                rows -= mode.matrix() * (mode.inverse() * *mean).cross_matrix();
+            } else {
+                *mean += by;
             }
-            *mean += moved.fixed_rows::<3>(3 * k);
         }
 
         let n = self.covariance.ncols();
@@ -340,7 +399,7 @@ impl<'a> Regression<'a> {
                 covariance[(j + 3, i + 3)] = mean;
             }
         }
-        Some(Posterior { mode, means, covariance })
+        Some(Posterior { means, covariance, expansion: Expansion { mode, moved } })
     }
 
     /// Matrix Fisher prior times the evidence.
@@ -353,10 +412,10 @@ impl<'a> Regression<'a> {
         RotationQuadratic { linear, quadratic }
     }
 
-    fn additive_mode(&self) -> Option<(Rotation3<f64>, Matrix3<f64>)> {
-        let information = self.rotation_information + self.evidence.fixed_view::<3, 3>(0, 0);
-        let error = -information.cholesky()?.solve(&self.evidence.fixed_view::<3, 1>(0, 3));
-        Some((self.prior * Rotation3::new(error), information))
+    fn additive_mode(&self) -> Option<Rotation3<f64>> {
+        let gradient = self.evidence.fixed_view::<3, 1>(0, 3);
+        let error = -self.information().cholesky()?.solve(&gradient);
+        Some(self.prior * Rotation3::new(error))
     }
 }
 

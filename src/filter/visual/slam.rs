@@ -6,7 +6,7 @@ use super::calibration::{BodyMotion, Calibration};
 use super::gate::Gate;
 use super::gravity::UnknownGravity;
 use super::regression::{
-    CALIBRATION_BLOCKS, Coordinates, Measurement, Posterior, Regression, Target,
+    CALIBRATION_BLOCKS, Coordinates, Expansion, Measurement, Posterior, Regression, Target,
 };
 use super::{
     FilterConfig, PointState, Rest, SeenPoint, UpdateOutcome, VisualInertialFilter, point_by_pose,
@@ -265,23 +265,23 @@ impl SlamFilter {
         let screening = self.gate.judge(regression.squared_distances(measurements)?.into_iter());
         let passed = measurements.iter().zip(self.gate.passed()).filter(|(_, passed)| **passed);
         let accepted: Vec<_> = passed.map(|(measurement, _)| *measurement).collect();
-        let mut weighted_at = prior;
+        let mut expansion = Expansion::of_prior(&prior, means.len());
         let mut renewals = self.config.relinearizations;
         let mut first = None;
         let posterior = loop {
-            let found = regression.condition(&accepted, &weighted_at, self.config.huber)?;
+            let found = regression.condition(&accepted, &expansion, self.config.huber)?;
             first.get_or_insert(found);
             let posterior = regression.posterior()?;
-            let turned = so3::log(&weighted_at.rotation_to(&posterior.mode)).norm();
+            let turned = so3::angle_between(&expansion.mode, &posterior.expansion.mode);
             if turned < RELINEARIZE_ABOVE || renewals == 0 {
                 break posterior;
             }
             renewals -= 1;
-            weighted_at = posterior.mode;
+            expansion = posterior.expansion;
             regression = of_prior()?;
         };
         let innovation = first?;
-        let turn = so3::log(&(prior.inverse() * posterior.mode));
+        let turn = so3::log(&(prior.inverse() * posterior.expansion.mode));
         let explained = 3.0 * accepted.len() as f64 * innovation;
         let turns_too_far = self.turn_distance(&turn)? > MOST_TURN * explained.max(NOISE_TURN);
         let outcome = UpdateOutcome { innovation, points: accepted.len(), screening };
@@ -295,7 +295,7 @@ impl SlamFilter {
     }
 
     fn accept(&mut self, posterior: Posterior) -> Option<()> {
-        let Posterior { mode, means, covariance } = posterior;
+        let Posterior { means, covariance, expansion: Expansion { mode, .. } } = posterior;
         let mean = |start: usize| means.get(start / 3 - 1).copied();
         let mut belief = self.belief;
         let state = &mut belief.state;
@@ -531,8 +531,8 @@ impl Conditioned {
     }
 }
 
-/// An attitude that moved further than this in an update has its measurements weighted anew at
-/// where it came to, rad.
+/// An attitude that moved further than this in an update is found anew with the terms of second
+/// order, and the weights, of where it came to, rad.
 const RELINEARIZE_ABOVE: f64 = 0.02;
 /// In a linear system an update turns the body by a squared Mahalanobis distance of at most that
 /// of the innovations. Beyond so many times that, the concentrated form has found the density's
@@ -1016,6 +1016,64 @@ mod tests {
             let nees = error.dot(&covariance.cholesky().unwrap().solve(&error));
             prop_assert!(nees < 21.1, "{nees} (99.99 %)");
         }
+    }
+
+    /// Lets the body seem to turn by 3.5 degrees before each of 20 frames in which it rests among
+    /// 30 points, as where the IMU's data have a gap.
+    fn turn_without_the_map(mfgs: &mut dyn VisualInertialFilter, prior: &NavState) {
+        let mut rng = ChaCha8Rng::seed_from_u64(31);
+        let noise = Matrix3::identity() * 0.002f64.powi(2);
+        let points: Vec<_> = (0..30).map(|id| seen(id, vector(&mut rng, 2.0), noise)).collect();
+        let state = mfgs.point_state().unwrap();
+        assert!(points.iter().all(|point| state.admit(point)));
+        mfgs.set_imu_gap(true);
+        let up = prior.world_from_body.rotation.inverse() * Vector3::z();
+        for frame in 0..20 {
+            let sample = |k: i64| ImuSample {
+                stamp: Stamp::from_nanos((frame + k) * 33_000_000),
+                angular_velocity: Vector3::new(1.5, -1.0, 0.5) + prior.gyro_bias,
+                specific_force: up * ImuConfig::default().gravity + prior.accel_bias,
+            };
+            assert!(mfgs.propagate(&sample(0), &sample(1)));
+            assert!(mfgs.point_state().unwrap().measure(&points).is_some());
+        }
+    }
+
+    /// Turns that the map does not share leave both where they are, however far from the world's
+    /// origin.
+    #[test]
+    fn a_turn_without_the_map_moves_neither() {
+        let mut rng = ChaCha8Rng::seed_from_u64(29);
+        let mut prior = belief(&mut rng, 0.01);
+        prior.covariance *= 1e-4;
+        prior.state.velocity = Vector3::zeros();
+        prior.state.world_from_body.translation.vector = Vector3::new(10.0, -6.0, 2.0);
+        let mut mfgs = filter(FilterKind::Mfgs, prior);
+        turn_without_the_map(mfgs.as_mut(), &prior.state);
+        let (before, after) = (prior.state.world_from_body, mfgs.belief().state.world_from_body);
+        let moved = (after.translation.vector - before.translation.vector).norm();
+        assert!(moved < 2e-3, "{moved} m");
+        assert!(before.rotation.angle_to(&after.rotation) < 2e-3);
+    }
+
+    /// Nor do they tell the heading.
+    #[test]
+    fn a_turn_without_the_map_tells_nothing_of_the_heading() {
+        let mut rng = ChaCha8Rng::seed_from_u64(37);
+        let mut prior = belief(&mut rng, 0.2);
+        prior.state.velocity = Vector3::zeros();
+        // A heading that is correlated with nothing else that could be learnt.
+        prior.covariance.rows_mut(0, 3).fill(0.0);
+        prior.covariance.columns_mut(0, 3).fill(0.0);
+        prior.covariance.view_mut((0, 0), (3, 3)).fill_diagonal(0.04);
+        let variance = |b: &Belief| {
+            let vertical = b.state.world_from_body.rotation.inverse() * Vector3::z();
+            vertical.dot(&(b.covariance.fixed_view::<3, 3>(0, 0) * vertical))
+        };
+        let mut mfgs = filter(FilterKind::Mfgs, prior);
+        turn_without_the_map(mfgs.as_mut(), &prior.state);
+        let (before, after) = (variance(&prior), variance(mfgs.belief()));
+        assert!(after > before * (1.0 - 1e-9), "{before} became {after}");
     }
 
     #[test]
