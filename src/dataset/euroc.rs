@@ -151,6 +151,7 @@ fn camera(folder: &Path) -> Result<(CameraConfig, (usize, usize)), LogError> {
         distortion: [k1, k2, p1, p2, 0.0],
         imu_from_camera: std::array::from_fn(|r| std::array::from_fn(|c| mount[4 * r + c])),
         time_offset: 0.0,
+        readout_time: 0.0,
     };
     Ok((camera, (width as usize, height as usize)))
 }

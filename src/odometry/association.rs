@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use nalgebra::{Isometry3, Matrix2, Matrix3, Point2, Point3, Vector2, Vector3};
 
+use super::shutter::Shutter;
 use super::{FrontEndFrame, OdometryConfig};
 use crate::alignment::PointPair;
 use crate::filter::SeenPoint;
@@ -18,9 +19,29 @@ pub(super) struct View<'a> {
     pub camera: &'a PinholeCamera,
     pub body_from_camera: &'a Isometry3<f64>,
     pub size: (usize, usize),
+    pub shutter: Shutter,
     pub seed: u64,
     /// Whether vision was lost before this frame.
     pub lost: bool,
+}
+
+impl View<'_> {
+    /// Row of the image that shows what is at an undistorted `pixel`.
+    pub fn row(&self, pixel: Point2<f64>) -> f64 {
+        self.config.camera.distort(pixel).y.clamp(0.0, self.size.1 as f64)
+    }
+
+    /// Undistorted pixel at which a point is seen that is at `in_camera` (m) at the stamp.
+    pub fn project(&self, in_camera: &Vector3<f64>) -> Option<Point2<f64>> {
+        let pixel = self.camera.project(in_camera)?;
+        self.camera.project(&self.shutter.at_row(in_camera, self.row(pixel)))
+    }
+
+    /// A measurement of what is seen at `pixel`, moved to where that is at the stamp.
+    pub fn at_stamp(&self, pixel: Point2<f64>, measured: PointMeasurement) -> PointMeasurement {
+        let point = self.shutter.at_stamp(&measured.point, self.row(pixel));
+        PointMeasurement { point, ..measured }
+    }
 }
 
 /// A feature and the map point that it looks like.
@@ -34,6 +55,16 @@ pub(super) struct Association {
     pub correspondence: Correspondence,
     /// Whether the present view should serve as the reference of later ones.
     pub renews_reference: bool,
+}
+
+impl Association {
+    /// Takes the camera's motion, which was thought to be that of `before`, for that of `view`.
+    pub fn reread(&mut self, features: &[Feature], before: &Shutter, view: &View) {
+        let Some(feature) = features.get(self.feature) else { return };
+        let point = &mut self.correspondence.measurement.point;
+        let row = view.row(feature.pixel);
+        *point = view.shutter.at_stamp(&before.at_row(point, row), row);
+    }
 }
 
 /// A matched feature as a measurement of its map point.
@@ -63,6 +94,7 @@ pub(super) fn place(
     align(feature, &depth, point, world_from_camera, view).or_else(|| {
         let (shift, sigma) = (Vector2::zeros(), feature.pixel_sigma);
         let measurement = feature.measurement_with(&depth, view.camera, shift, sigma);
+        let measurement = view.at_stamp(feature.pixel, measurement);
         Some(Placed { measurement, renews_reference: true })
     })
 }
@@ -87,8 +119,9 @@ fn align(
     let sigma = config.pixel_sigma * feature.scale;
     let shift = found.shift * feature.scale;
     let change = warp.determinant().abs().sqrt();
+    let measurement = feature.measurement_with(depth, view.camera, shift, sigma);
     Some(Placed {
-        measurement: feature.measurement_with(depth, view.camera, shift, sigma),
+        measurement: view.at_stamp(feature.pixel, measurement),
         renews_reference: change.max(change.recip()) > config.max_scale_change,
     })
 }
@@ -105,7 +138,7 @@ pub(super) fn seek(
     let reference = point.reference.as_ref()?;
     let position = Point3::from(point.position);
     let in_camera = world_from_camera.inverse_transform_point(&position).coords;
-    let predicted = view.camera.project(&in_camera)?;
+    let predicted = view.project(&in_camera)?;
     let then = reference.world_from_camera.inverse_transform_point(&position).z;
     let as_taken = view.config.camera.distort(predicted);
     let glimpse = front.extraction.pyramid.look(as_taken, reference.scale * then / in_camera.z)?;
@@ -180,7 +213,7 @@ pub(super) fn reference(
     view: &View,
 ) -> Option<ReferenceView> {
     let in_camera = world_from_camera.inverse_transform_point(&Point3::from(point.position));
-    let offset = (view.camera.project(&in_camera.coords)? - feature.pixel) / feature.scale;
+    let offset = (view.project(&in_camera.coords)? - feature.pixel) / feature.scale;
     let near = offset.norm() <= view.config.patch.max_shift;
     let first = first_reference(feature, world_from_camera).filter(|_| near)?;
     Some(ReferenceView { offset, ..first })
@@ -274,6 +307,7 @@ mod tests {
             camera: &camera,
             body_from_camera: &Isometry3::identity(),
             size: SIZE,
+            shutter: Shutter::default(),
             seed: 0,
             lost: false,
         };

@@ -9,6 +9,7 @@ mod report;
 mod rest;
 mod restart;
 mod runner;
+mod shutter;
 mod state_points;
 mod truth;
 mod watch;

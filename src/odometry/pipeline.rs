@@ -13,6 +13,7 @@ use super::report::{
 };
 use super::rest::RestDetector;
 use super::restart::{Legacy, Spread};
+use super::shutter::{Shutter, given_pose};
 use super::truth::TruthTrack;
 use super::watch::{Agreement, SensorWatch};
 use super::{OdometryConfig, TruthPose, renew_state_points};
@@ -418,23 +419,26 @@ impl Odometry {
         let body_from_camera = self.body_from_camera();
         let running = self.running.as_mut()?;
         let mut notes = std::mem::take(&mut self.notes);
-        let view = View {
-            config: &self.config,
-            camera: &self.camera,
-            body_from_camera: &body_from_camera,
-            size: (front.frame.color.width(), front.frame.color.height()),
-            seed: self.seed.wrapping_add(number),
-            lost: self.health.is_lost(),
-        };
+        let size = (front.frame.color.width(), front.frame.color.height());
+        let lost = self.health.is_lost();
         let mut times = StageTimes { features: front.seconds, ..StageTimes::default() };
         let mut clock = StageClock::start();
         self.stats.imu_gaps += running.propagate_to(
             stamp,
             &mut self.imu,
             self.watch.is_noisy(stamp),
-            view.config,
+            &self.config,
             &mut notes,
         );
+        let mut view = View {
+            config: &self.config,
+            camera: &self.camera,
+            body_from_camera: &body_from_camera,
+            size,
+            shutter: running.shutter(&self.config, size, &body_from_camera, None),
+            seed: self.seed.wrapping_add(number),
+            lost,
+        };
         times.propagation = clock.lap();
 
         let features = &front.extraction.features;
@@ -449,6 +453,12 @@ impl Odometry {
         let mut inliers = agreement.map(|agreement| agreement.inliers).unwrap_or_default();
         times.ransac = clock.lap();
 
+        if let Some(pose) = pose.filter(|_| view.shutter.is_rolling()) {
+            let known = Some(&pose);
+            let shutter = running.shutter(view.config, view.size, &body_from_camera, known);
+            let before = std::mem::replace(&mut view.shutter, shutter);
+            matches.iter_mut().for_each(|m| m.reread(features, &before, &view));
+        }
         if let Some(pose) = pose.filter(|_| view.config.search.seek_state_points) {
             running.seek_state_points(&pose, front, &mut matches, &mut inliers, &view);
         }
@@ -495,7 +505,8 @@ impl Odometry {
         let lost = self.health.is_lost();
         let estimate = running.filter.calibration().map(|estimate| estimate.body_from_camera);
         let body_from_camera = estimate.unwrap_or(body_from_camera);
-        let view = View { body_from_camera: &body_from_camera, ..view };
+        let shutter = running.shutter(view.config, view.size, &body_from_camera, None);
+        let view = View { body_from_camera: &body_from_camera, shutter, ..view };
         let fates = running.grow_map(features, &matches, &inliers, treatment, lost, &view);
         times.map = clock.lap();
 
@@ -622,6 +633,22 @@ impl Running {
         Some(Note { level: NoteLevel::Info, text })
     }
 
+    /// How the camera moves while it takes an image: as the belief has it, or would have it if the
+    /// camera were at `pose`.
+    fn shutter(
+        &self,
+        config: &OdometryConfig,
+        size: (usize, usize),
+        body_from_camera: &Isometry3<f64>,
+        pose: Option<&Isometry3<f64>>,
+    ) -> Shutter {
+        let belief = self.filter.belief();
+        let given = pose.and_then(|pose| given_pose(belief, &(pose * body_from_camera.inverse())));
+        let state = given.unwrap_or(belief.state);
+        let rate = self.last_imu.map_or_else(Vector3::zeros, |sample| sample.angular_velocity);
+        Shutter::new(&config.camera, size.1, body_from_camera, &state, &rate)
+    }
+
     fn world_from_camera(&self, view: &View) -> Isometry3<f64> {
         self.filter.belief().state.world_from_body * view.body_from_camera
     }
@@ -677,7 +704,7 @@ impl Running {
         let predict = |point: &MapPoint| -> Option<Prediction> {
             let in_camera =
                 world_from_camera.inverse_transform_point(&Point3::from(point.position)).coords;
-            let pixel = view.camera.project(&in_camera)?;
+            let pixel = view.project(&in_camera)?;
             // Spread of the prediction in the image: turning by `e` moves it by about `f e`,
             // moving by `d` by `f d / z`.
             let in_body = (view.body_from_camera * Point3::from(in_camera)).coords;
@@ -943,6 +970,7 @@ impl Running {
                 continue;
             }
             let Some(measurement) = feature.measurement(view.camera) else { continue };
+            let measurement = view.at_stamp(feature.pixel, measurement);
             let (in_body, covariance) = in_body(&measurement, view);
             let estimate = self.filter.insert(treatment, &in_body, &covariance);
             let reference = first_reference(feature, &world_from_camera);

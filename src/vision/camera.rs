@@ -20,6 +20,9 @@ pub struct CameraConfig {
     pub imu_from_camera: [[f64; 4]; 4],
     /// Added to camera stamps to bring them to the IMU's clock, s.
     pub time_offset: f64,
+    /// Time from the exposure of the first row to that of the last one, s: a rolling shutter, whose
+    /// middle row is exposed at the stamp; 0: all rows at once.
+    pub readout_time: f64,
 }
 
 impl Default for CameraConfig {
@@ -32,6 +35,7 @@ impl Default for CameraConfig {
             distortion: [0.0; 5],
             imu_from_camera: Matrix4::identity().transpose().into(),
             time_offset: 0.0,
+            readout_time: 0.0,
         }
     }
 }

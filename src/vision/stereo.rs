@@ -107,6 +107,7 @@ impl Rectification {
                 std::array::from_fn(|column| matrix[(row, column)])
             }),
             time_offset: left.time_offset,
+            readout_time: left.readout_time,
         };
         Ok(Self { camera, baseline, left_from_rectified, right_from_rectified })
     }
@@ -358,6 +359,7 @@ mod tests {
             distortion: [-0.2, 0.05, 1e-3, -5e-4, 0.0],
             imu_from_camera: std::array::from_fn(|r| std::array::from_fn(|c| pose[(r, c)])),
             time_offset: 0.0,
+            readout_time: 0.0,
         }
     }
 
