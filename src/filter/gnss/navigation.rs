@@ -379,24 +379,30 @@ fn initial_belief(
     })
 }
 
-/// Distances of withheld fixes from their predictions, by outage.
+/// Withheld fixes by outage.
 #[derive(Default)]
 struct OutageErrors {
-    /// Number of the outage, start, distances and their normalized squares.
-    outages: Vec<(usize, f64, Vec<(f64, f64)>)>,
+    outages: Vec<OutageError>,
+}
+
+struct OutageError {
+    number: usize,
+    start: f64,
+    /// Distances of fixes from their predictions, and their normalized squares.
+    errors: Vec<(f64, f64)>,
 }
 
 impl OutageErrors {
     fn add(&mut self, number: usize, elapsed: f64, innovation: &Innovation) {
         let error = (innovation.residual.norm(), innovation.nis);
         match self.outages.last_mut() {
-            Some((last, _, errors)) if *last == number => errors.push(error),
-            _ => self.outages.push((number, elapsed, vec![error])),
+            Some(last) if last.number == number => last.errors.push(error),
+            _ => self.outages.push(OutageError { number, start: elapsed, errors: vec![error] }),
         }
     }
 
     fn reports(&self) -> Vec<OutageReport> {
-        let report = |(_, start, errors): &(usize, f64, Vec<(f64, f64)>)| {
+        let report = |OutageError { start, errors, .. }: &OutageError| {
             let mean = |sum: f64| sum / errors.len() as f64;
             OutageReport {
                 start: *start,
