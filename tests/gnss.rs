@@ -179,9 +179,9 @@ fn a_gap_that_was_filled_in_is_found_and_bridged() {
     let (first, last) = (6000, 6700);
     for k in first + 1..last {
         let share = (k - first) as f64 / (last - first) as f64;
-        for column in 1..7 {
-            rows[k][column] = rows[first][column] * (1.0 - share) + rows[last][column] * share;
-        }
+        let between = |(a, b): (&f64, &f64)| a * (1.0 - share) + b * share;
+        let readings: Vec<_> = rows[first].iter().zip(&rows[last]).skip(1).map(between).collect();
+        rows[k].splice(1.., readings);
     }
     let texts: Vec<String> = rows
         .iter()
