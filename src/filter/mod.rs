@@ -14,7 +14,7 @@ pub use bayes::{
 };
 pub use visual::{
     BodyPoints, Calibration, Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude,
-    MapRefinement, MapTreatment, Mekf, MfgFilter, PointState, Rest, Screening, SeenPoint,
-    SlamFilter, UpdateMethod, UpdateOutcome, VisualInertialFilter, calibration_block,
+    MapRefinement, MapTreatment, Mekf, MfgFilter, MotionSpread, PointState, Rest, Screening,
+    SeenPoint, SlamFilter, UpdateMethod, UpdateOutcome, VisualInertialFilter, calibration_block,
     choose_points, point_by_pose, pose_covariance,
 };

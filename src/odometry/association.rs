@@ -58,6 +58,20 @@ pub(super) struct Association {
 }
 
 impl Association {
+    pub fn new(feature: usize, point: &MapPoint, predicted: Point2<f64>, placed: Placed) -> Self {
+        Self {
+            feature,
+            point: point.id,
+            predicted,
+            correspondence: Correspondence {
+                measurement: placed.measurement,
+                world: point.position,
+                world_covariance: point.covariance,
+            },
+            renews_reference: placed.renews_reference,
+        }
+    }
+
     /// Takes the camera's motion, which was thought to be that of `before`, for that of `view`.
     pub fn reread(&mut self, features: &[Feature], before: &Shutter, view: &View) {
         let Some(feature) = features.get(self.feature) else { return };
@@ -154,21 +168,11 @@ pub(super) fn seek(
         depth: Some(depth),
     };
     let placed = align(&feature, &depth, point, world_from_camera, view)?;
-    let correspondence = Correspondence {
-        measurement: placed.measurement,
-        world: point.position,
-        world_covariance: point.covariance,
-    };
+    let next = front.extraction.features.len();
+    let association = Association::new(next, point, predicted, placed);
     let agrees = Reprojection::new(view.camera, &view.config.ransac)
-        .error(world_from_camera, &correspondence)
+        .error(world_from_camera, &association.correspondence)
         <= 1.0;
-    let association = Association {
-        feature: front.extraction.features.len(),
-        point: point.id,
-        predicted,
-        correspondence,
-        renews_reference: placed.renews_reference,
-    };
     agrees.then_some((feature, association))
 }
 

@@ -115,6 +115,11 @@ impl Health {
         self.lost_since.is_some()
     }
 
+    /// Whether vision was lost though there was enough to see.
+    pub fn is_lost_in_sight(&self) -> bool {
+        self.is_lost() && self.lost_in_sight
+    }
+
     pub fn summary(&self) -> &HealthSummary {
         &self.summary
     }

@@ -5,6 +5,7 @@ mod event;
 mod health;
 mod init;
 mod pipeline;
+mod recognition;
 mod report;
 mod rest;
 mod restart;

@@ -8,6 +8,7 @@ use super::association::{
 };
 use super::health::{Divergence, Health, HealthSummary, Sight};
 use super::init::{Attempt, Evidence, Initializer};
+use super::recognition::{InView, Jump, spread_of_recognition};
 use super::report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
@@ -19,8 +20,8 @@ use super::watch::{Agreement, SensorWatch};
 use super::{OdometryConfig, TruthPose, renew_state_points};
 use crate::alignment::PointPair;
 use crate::filter::{
-    Calibration, FilterKind, KnownAttitude, MapTreatment, PointState, SeenPoint, UpdateOutcome,
-    VisualInertialFilter, point_by_pose,
+    Calibration, FilterConfig, FilterKind, KnownAttitude, MapTreatment, PointState, SeenPoint,
+    UpdateOutcome, VisualInertialFilter, point_by_pose,
 };
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, Stamp};
 use crate::map::{Map, MapPoint, Sighting};
@@ -445,13 +446,29 @@ impl Odometry {
         let detected = features.len();
         let with_depth = features.iter().filter(|feature| feature.depth.is_some()).count();
         notes.extend(self.watch.frame(stamp, features, view.size));
-        let (candidates, mut matches) = running.find_matches(features, &view);
-        times.matching = clock.lap();
-
-        let (agreement, others) = running.find_pose(&matches, &view);
-        let pose = agreement.as_ref().map(|agreement| agreement.model);
-        let mut inliers = agreement.map(|agreement| agreement.inliers).unwrap_or_default();
-        times.ransac = clock.lap();
+        let mut found = running.look(features, &view, &mut clock, &mut times);
+        if let (Some(pose), Some((before, sound))) = (found.pose, &self.sound)
+            && running.filter.knows_vertical()
+            && running.filter.point_state().is_some()
+        {
+            let world_from_body = pose * body_from_camera.inverse();
+            let after = stamp.seconds_since(*before);
+            let in_the_dark = lost && !self.health.is_lost_in_sight();
+            let jump = Jump::between(&sound.state, &world_from_body, after, in_the_dark);
+            let seen =
+                (lost || jump.is_some()).then(|| running.in_view(&pose, front, &found, &view));
+            if let Some(seen) = seen.filter(|seen| !seen.confirms()) {
+                tracing::debug!("at {stamp} s {seen:?} do not confirm a pose");
+                found.pose = None;
+                found.inliers.clear();
+            } else if let Some((jump, seen)) = jump.zip(seen) {
+                running.carry_off(&world_from_body, &self.config.filter);
+                notes.push(jump.note(stamp, seen));
+                view.shutter = running.shutter(&self.config, size, &body_from_camera, None);
+                found = running.look(features, &view, &mut clock, &mut times);
+            }
+        }
+        let Found { candidates, mut matches, pose, mut inliers, others } = found;
 
         if let Some(pose) = pose.filter(|_| view.shutter.is_rolling()) {
             let known = Some(&pose);
@@ -539,6 +556,19 @@ impl Odometry {
             notes,
         })
     }
+}
+
+/// What was found of the map in a frame.
+struct Found {
+    /// Map points looked for.
+    candidates: usize,
+    matches: Vec<Association>,
+    /// World from camera, as the inliers agree.
+    pose: Option<Isometry3<f64>>,
+    /// Indices into the matches.
+    inliers: Vec<usize>,
+    /// Matches that agree on another pose.
+    others: usize,
 }
 
 /// What became of a feature.
@@ -669,8 +699,37 @@ impl Running {
         reported.attitude().map(|attitude| *attitude.svd())
     }
 
+    /// Looks for the map in a frame; where nothing of it agrees near the prediction, everywhere.
+    fn look(
+        &self,
+        features: &[Feature],
+        view: &View,
+        clock: &mut StageClock,
+        times: &mut StageTimes,
+    ) -> Found {
+        let (mut candidates, mut matches) = self.find_matches(features, view);
+        times.matching += clock.lap();
+        let (mut agreement, mut others) = self.find_pose(&matches, view);
+        if agreement.is_none() && candidates < self.map.len() {
+            let anywhere = self.match_everywhere(features, view);
+            let (agreeing, moving) = self.find_pose(&anywhere, view);
+            if agreeing.is_some() {
+                (candidates, matches) = (self.map.len(), anywhere);
+                (agreement, others) = (agreeing, moving);
+            }
+        }
+        times.ransac += clock.lap();
+        Found {
+            candidates,
+            matches,
+            pose: agreement.as_ref().map(|agreement| agreement.model),
+            inliers: agreement.map(|agreement| agreement.inliers).unwrap_or_default(),
+            others,
+        }
+    }
+
     /// Number of map points that should be visible, and the features that look like one.
-    fn find_matches(&mut self, features: &[Feature], view: &View) -> (usize, Vec<Association>) {
+    fn find_matches(&self, features: &[Feature], view: &View) -> (usize, Vec<Association>) {
         let world_from_camera = self.world_from_camera(view);
         let ids = self.map.candidates(&world_from_camera, view.camera, view.size.0, view.size.1);
         let enough = view.config.search.min_matches;
@@ -681,11 +740,44 @@ impl Running {
         }
         if associations.len() < enough && view.lost {
             // The prediction has been without correction: everything may be anywhere.
-            let ids: Vec<_> = self.map.points().iter().map(|point| point.id).collect();
-            associations = self.match_candidates(&ids, features, view, Some(f64::INFINITY));
-            return (ids.len(), associations);
+            return (self.map.len(), self.match_everywhere(features, view));
         }
         (ids.len(), associations)
+    }
+
+    fn match_everywhere(&self, features: &[Feature], view: &View) -> Vec<Association> {
+        let ids: Vec<_> = self.map.points().iter().map(|point| point.id).collect();
+        self.match_candidates(&ids, features, view, Some(f64::INFINITY))
+    }
+
+    /// What is seen of the points of the state that a camera at `world_from_camera` has in view.
+    fn in_view(
+        &self,
+        world_from_camera: &Isometry3<f64>,
+        front: &FrontEndFrame,
+        found: &Found,
+        view: &View,
+    ) -> InView {
+        let matched: HashSet<_> =
+            found.inliers.iter().filter_map(|&i| found.matches.get(i)).map(|m| m.point).collect();
+        let (width, height) = view.size;
+        let mut in_view = InView { agreeing: found.inliers.len(), expected: 0, seen: 0 };
+        for id in self.map.candidates(world_from_camera, view.camera, width, height) {
+            let Some(point) = self.map.get(id).filter(|point| point.held) else { continue };
+            let seen =
+                matched.contains(&id) || seek(point, world_from_camera, front, view).is_some();
+            in_view.expected += 1;
+            in_view.seen += usize::from(seen);
+        }
+        in_view
+    }
+
+    /// Puts the body at a pose that the map is seen from.
+    fn carry_off(&mut self, world_from_body: &Isometry3<f64>, config: &FilterConfig) {
+        let way = self.filter.belief().state.world_from_body.inv_mul(world_from_body);
+        if let Some(points) = self.filter.point_state() {
+            points.carry_off(&way, &spread_of_recognition(config));
+        }
     }
 
     /// Looks for map points near where they are predicted: within their uncertainty, or within
@@ -724,17 +816,7 @@ impl Running {
             let (point, prediction) = (points.get(m.query)?, predictions.get(m.query)?);
             let feature = features.get(m.train)?;
             let placed = place(feature, point, &world_from_camera, view)?;
-            Some(Association {
-                feature: m.train,
-                point: point.id,
-                predicted: prediction.pixel,
-                correspondence: Correspondence {
-                    measurement: placed.measurement,
-                    world: point.position,
-                    world_covariance: point.covariance,
-                },
-                renews_reference: placed.renews_reference,
-            })
+            Some(Association::new(m.train, point, prediction.pixel, placed))
         };
         let matches = match_guided(&predictions, features, &view.config.matching);
         matches.into_iter().filter_map(associate).collect()

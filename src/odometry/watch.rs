@@ -28,8 +28,8 @@ const OBSTRUCTED: f64 = 0.7;
 /// A bias beyond this many of its standard deviations at the start is no bias of this sensor.
 const UNUSUAL_BIAS: f64 = 5.0;
 /// What no hand and no vehicle does, rad/s and m/s^2: units are wrong, or the sensor is.
-const MAX_RATE: f64 = 20.0;
-const MAX_FORCE: f64 = 150.0;
+pub(super) const MAX_RATE: f64 = 20.0;
+pub(super) const MAX_FORCE: f64 = 150.0;
 /// The mean specific force is compared with gravity over about this time, s, and within this factor.
 const FORCE_TIME: f64 = 0.3;
 const FORCE_FACTOR: f64 = 1.6;

@@ -16,7 +16,7 @@ mod slam;
 use std::fmt;
 use std::str::FromStr;
 
-use nalgebra::{Matrix3, Matrix6, Rotation3, SMatrix, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Matrix6, Rotation3, SMatrix, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::alignment::{MapEstimate, PointPair, PoseInformation, RobustKernel};
@@ -430,6 +430,21 @@ pub trait PointState {
 
     /// Marginalizes a point out: what the belief learned by it stays. False if it is not held.
     fn release(&mut self, id: u64) -> bool;
+
+    /// Moves the body by `way`, in body coordinates, which is known as well as `spread` says, and leaves
+    /// it at rest there. Points, biases and calibration stay. The vertical must be known.
+    fn carry_off(&mut self, way: &Isometry3<f64>, spread: &MotionSpread);
+}
+
+/// Standard deviations of each component of pose and velocity.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MotionSpread {
+    /// rad.
+    pub turn: f64,
+    /// m.
+    pub shift: f64,
+    /// m/s.
+    pub velocity: f64,
 }
 
 impl dyn VisualInertialFilter + '_ {

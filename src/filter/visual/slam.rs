@@ -1,6 +1,8 @@
 //! Filters that keep map points in the state, with all correlations (`mfgs`, `mekfs`).
 
-use nalgebra::{DMatrix, DVector, Dyn, Matrix3, OMatrix, Point3, U3, UnitQuaternion, Vector3};
+use nalgebra::{
+    DMatrix, DVector, Dyn, Isometry3, Matrix3, OMatrix, Point3, U3, UnitQuaternion, Vector3,
+};
 
 use super::calibration::{BodyMotion, Calibration};
 use super::gate::Gate;
@@ -9,7 +11,8 @@ use super::regression::{
     CALIBRATION_BLOCKS, Coordinates, Expansion, Measurement, Posterior, Regression, Target,
 };
 use super::{
-    FilterConfig, PointState, Rest, SeenPoint, UpdateOutcome, VisualInertialFilter, point_by_pose,
+    FilterConfig, MotionSpread, PointState, Rest, SeenPoint, UpdateOutcome, VisualInertialFilter,
+    point_by_pose,
 };
 use crate::alignment::{MapEstimate, PointPair};
 use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block};
@@ -730,6 +733,31 @@ impl PointState for SlamFilter {
         self.covariance = covariance.remove_fixed_rows::<3>(row).remove_fixed_columns::<3>(row);
         true
     }
+
+    fn carry_off(&mut self, way: &Isometry3<f64>, spread: &MotionSpread) {
+        let rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
+        let mut step = NavCovariance::identity();
+        let mut set = |row: usize, column: usize, value: Matrix3<f64>| {
+            step.fixed_view_mut::<3, 3>(row, column).copy_from(&value);
+        };
+        let turned = way.rotation.to_rotation_matrix().into_inner().transpose();
+        let lever = way.translation.vector.cross_matrix();
+        set(block::ROTATION, block::ROTATION, turned);
+        set(block::POSITION, block::ROTATION, -(rotation * lever));
+        set(block::VELOCITY, block::VELOCITY, Matrix3::zeros());
+        self.transition = step * self.transition;
+        let covariance = &mut self.belief.covariance;
+        *covariance = step * *covariance * step.transpose();
+        for (row, sd) in [
+            (block::ROTATION, spread.turn),
+            (block::POSITION, spread.shift),
+            (block::VELOCITY, spread.velocity),
+        ] {
+            (row..row + 3).for_each(|k| covariance[(k, k)] += sd * sd);
+        }
+        self.belief.state.world_from_body *= way;
+        self.belief.state.velocity = Vector3::zeros();
+    }
 }
 
 #[cfg(test)]
@@ -738,7 +766,7 @@ mod tests {
     use crate::filter::FilterKind;
     use crate::inertial::{ImuConfig, NavState, Stamp};
     use approx::assert_relative_eq;
-    use nalgebra::{Isometry3, SVector};
+    use nalgebra::SVector;
     use proptest::prelude::*;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
@@ -846,6 +874,46 @@ mod tests {
             let turned = turned.angle_to(&prior.state.world_from_body.rotation);
             prop_assert!(turned < 1e-7, "{turned}");
         }
+    }
+
+    /// By its map a body that was carried off is found again, as unsure of the world as the map is.
+    #[test]
+    fn a_body_that_is_carried_off_is_found_by_its_map() {
+        let mut rng = ChaCha8Rng::seed_from_u64(8);
+        let prior = belief(&mut rng, 0.02);
+        let mut mfgs = filter(FilterKind::Mfgs, prior);
+        let start = prior.state.world_from_body;
+        let way = Isometry3::new(Vector3::new(0.5, -0.3, 0.1), Vector3::new(0.1, 0.4, -0.2));
+        let elsewhere = start * way;
+        let noise = Matrix3::identity() * 1e-4;
+        let places: Vec<_> = (0..20).map(|_| vector(&mut rng, 3.0)).collect();
+        let state = mfgs.point_state().unwrap();
+        assert!((0..).zip(&places).all(|(id, place)| state.admit(&seen(id, *place, noise))));
+        // The matches were a degree and some centimetres off.
+        let found = way * Isometry3::new(Vector3::repeat(0.03), Vector3::repeat(0.01));
+        state.carry_off(&found, &MotionSpread { turn: 0.2, shift: 0.5, velocity: 1.0 });
+        let again: Vec<_> = (0..)
+            .zip(&places)
+            .map(|(id, place)| {
+                seen(id, way.inverse_transform_point(&(*place).into()).coords, noise)
+            })
+            .collect();
+        let outcome = state.measure(&again).unwrap();
+        assert!(outcome.points == 20 && outcome.innovation < 1.0, "{outcome:?}");
+        let after = mfgs.belief();
+        let pose = after.state.world_from_body;
+        let shift = pose.inv_mul(&elsewhere).translation.vector.norm();
+        assert!(shift < 1e-3, "{shift} m");
+        assert!(pose.rotation.angle_to(&elsewhere.rotation) < 1e-3);
+        // Of a standard deviation of 0.1; it is correlated with the pose, hence with the map.
+        assert_relative_eq!(after.state.accel_bias, prior.state.accel_bias, epsilon = 1e-5);
+        let in_world = |belief: &Belief| {
+            let rotation = belief.state.world_from_body.rotation.to_rotation_matrix();
+            let covariance = belief.covariance.fixed_view::<3, 3>(0, 0);
+            rotation.matrix() * covariance * rotation.matrix().transpose()
+        };
+        let known = in_world(&prior);
+        assert_relative_eq!(in_world(after), known, epsilon = 0.02 * known.norm());
     }
 
     /// The rival's linearisation follows its estimates of the points and so finds information
