@@ -7,7 +7,7 @@
 //! counts. The map error is the mean over the landmarks seen so far, averaged over the frames.
 //! The paper gives no positions of landmarks; ours are uniform in a box around the circle.
 //!
-//! Filters whose state holds the landmarks (`mfgs`, `mekfs`) use every third one, never forget it,
+//! Filters whose state holds the landmarks (`mfgs`, `mekfs`) use every second one, never forget it,
 //! and are judged by the map of those. They start with a map and a known heading.
 
 use std::time::Instant;
@@ -159,7 +159,7 @@ const UNKNOWN_MAP: &Drives = &Drives {
 };
 
 /// Of so many landmarks one is taken by filters whose state holds them.
-const STATE_STRIDE: usize = 3;
+const STATE_STRIDE: usize = 2;
 /// Standard deviation of each component of the initial rotation vector (rad), velocity (m/s) and
 /// position (m).
 const INITIAL_SD: f64 = 0.1;

@@ -1,6 +1,6 @@
 //! The regression of the Euclidean state on the rotation, and how points condition it.
 
-use nalgebra::{DMatrix, DMatrixViewMut, Matrix3, Rotation3, SMatrix, SVector, Vector3};
+use nalgebra::{DMatrix, Dyn, Matrix3, OMatrix, Rotation3, SMatrix, SVector, U3, Vector3};
 
 use crate::distribution::rotation_quadratic::{
     RotationQuadratic, rotated_vector_by_rotation, vectorize,
@@ -16,6 +16,8 @@ pub(super) const CALIBRATION_BLOCKS: usize = 3;
 /// Points that are conditioned on at once. Their innovations are decorrelated by substitution,
 /// whose cost grows with the size of the batch; all that follows is matrix products.
 const BATCH: usize = 16;
+/// Columns of the covariance that are updated at once, a multiple of three.
+const PANEL: usize = 96;
 
 /// What the Euclidean part is regressed on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -73,6 +75,7 @@ pub(super) struct Regression<'a> {
     rotation_information: Matrix3<f64>,
     rotation_covariance: Matrix3<f64>,
     slope: DMatrix<f64>,
+    /// Blocks of three on and above the diagonal; those below it are out of date.
     covariance: DMatrix<f64>,
     evidence: DMatrix<f64>,
 }
@@ -116,7 +119,8 @@ impl<'a> Regression<'a> {
         let rotation_information = rotation_covariance.cholesky()?.inverse();
         let cross = covariance.view((3, 0), (n, 3));
         let mut by_rotation = cross * rotation_information;
-        let mut conditional = covariance.view((3, 3), (n, n)).into_owned();
+        let mut conditional = DMatrix::zeros(n, n);
+        conditional.copy_from(&covariance.view((3, 3), (n, n)));
         conditional.gemm(-1.0, &by_rotation, &cross.transpose(), 1.0);
 
         let mut sum = Self {
@@ -212,11 +216,7 @@ impl<'a> Regression<'a> {
         let rows = self.design(measurement, expansion);
         let residual = (&rows * at_prior).fixed_view::<3, 1>(0, 0).into_owned();
         let by_rotation = (rows * derivative).fixed_view::<3, 3>(0, 0).into_owned();
-        let mut cross = DMatrix::zeros(self.covariance.nrows(), 3);
-        self.add_cross(measurement, &mut cross.columns_mut(0, 3));
-        let mut given_rotation = DMatrix::zeros(3, 3);
-        self.add_innovation(measurement, &cross, &mut given_rotation.columns_mut(0, 3));
-        let spread = given_rotation.fixed_view::<3, 3>(0, 0)
+        let spread = self.residual_covariance(measurement)
             + by_rotation * self.rotation_covariance * by_rotation.transpose()
             + noise;
         let squared = residual.dot(&spread.cholesky()?.solve(&residual));
@@ -277,26 +277,28 @@ impl<'a> Regression<'a> {
         }
     }
 
-    /// Adds the covariance of `x` given the rotation with the residual of a measurement (n x 3).
-    fn add_cross(&self, measurement: &Measurement, sum: &mut DMatrixViewMut<f64>) {
-        *sum += self.covariance.columns(3 * POSITION, 3);
-        if let Target::State { block } = measurement.target {
-            *sum -= self.covariance.columns(3 * block, 3);
+    /// Covariance of the residual of a measurement given the rotation, without noise.
+    fn residual_covariance(&self, measurement: &Measurement) -> Matrix3<f64> {
+        let block = |i: usize, j: usize| self.covariance.fixed_view::<3, 3>(3 * i, 3 * j);
+        let position = block(POSITION, POSITION);
+        match measurement.target {
+            Target::State { block: point } => {
+                let cross = block(POSITION.min(point), POSITION.max(point));
+                position + block(point, point) - cross - cross.transpose()
+            }
+            Target::Known { .. } => position.into_owned(),
         }
     }
 
-    /// Adds the covariance of the residual of a measurement with those whose covariance with `x`
-    /// is `cross` (3 x m).
-    fn add_innovation(
-        &self,
-        measurement: &Measurement,
-        cross: &DMatrix<f64>,
-        sum: &mut DMatrixViewMut<f64>,
-    ) {
-        *sum += cross.rows(3 * POSITION, 3);
-        if let Target::State { block } = measurement.target {
-            *sum -= cross.rows(3 * block, 3);
-        }
+    /// Covariance of `x` given the rotation with one of its blocks (n x 3).
+    fn columns(&self, block: usize) -> OMatrix<f64, Dyn, U3> {
+        let (n, start) = (self.covariance.nrows(), 3 * block);
+        let above = start + 3;
+        let mut columns = OMatrix::<f64, Dyn, U3>::zeros(n);
+        columns.rows_mut(0, above).copy_from(&self.covariance.view((0, start), (above, 3)));
+        let below = self.covariance.view((start, above), (3, n - above)).transpose();
+        columns.rows_mut(above, n - above).copy_from(&below);
+        columns
     }
 
     fn condition_batch(
@@ -309,13 +311,22 @@ impl<'a> Regression<'a> {
         // Covariance of x and the innovations, columns of which are contiguous.
         let mut cross = DMatrix::zeros(n, m);
         let mut design = DMatrix::zeros(m, self.coordinates.size());
+        let position = self.columns(POSITION);
         for (i, measurement) in batch.iter().enumerate() {
-            self.add_cross(measurement, &mut cross.columns_mut(3 * i, 3));
+            let mut columns = cross.fixed_columns_mut::<3>(3 * i);
+            columns.copy_from(&position);
+            if let Target::State { block } = measurement.target {
+                columns -= self.columns(block);
+            }
             design.rows_mut(3 * i, 3).copy_from(&self.design(measurement, expansion));
         }
         let mut innovation = DMatrix::zeros(m, m);
         for (i, (measurement, noise)) in batch.iter().zip(noises).enumerate() {
-            self.add_innovation(measurement, &cross, &mut innovation.rows_mut(3 * i, 3));
+            let mut rows = innovation.rows_mut(3 * i, 3);
+            rows += cross.rows(3 * POSITION, 3);
+            if let Target::State { block } = measurement.target {
+                rows -= cross.rows(3 * block, 3);
+            }
             let mut own = innovation.fixed_view_mut::<3, 3>(3 * i, 3 * i);
             own += noise;
         }
@@ -331,7 +342,7 @@ impl<'a> Regression<'a> {
         }
         factor.solve_lower_triangular_mut(&mut design).then_some(())?;
 
-        self.covariance.gemm(-1.0, &cross, &cross.transpose(), 1.0);
+        subtract_square(&mut self.covariance, &cross);
         self.slope.gemm(-1.0, &cross, &design, 1.0);
         self.evidence += design.transpose() * &design;
         Some(())
@@ -390,15 +401,9 @@ impl<'a> Regression<'a> {
         euclidean.gemm(1.0, &cross, &by_rotation.transpose(), 1.0);
         let mut covariance = DMatrix::zeros(n + 3, n + 3);
         covariance.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation_covariance);
-        covariance.view_mut((3, 0), (n, 3)).copy_from(&cross);
         covariance.view_mut((0, 3), (3, n)).copy_from(&cross.transpose());
-        for j in 0..n {
-            for i in 0..=j {
-                let mean = 0.5 * (euclidean[(i, j)] + euclidean[(j, i)]);
-                covariance[(i + 3, j + 3)] = mean;
-                covariance[(j + 3, i + 3)] = mean;
-            }
-        }
+        covariance.view_mut((3, 3), (n, n)).copy_from(&euclidean);
+        covariance.fill_lower_triangle_with_upper_triangle();
         Some(Posterior { means, covariance, expansion: Expansion { mode, moved } })
     }
 
@@ -445,6 +450,18 @@ impl Coordinates {
             Self::Additive => derivative.fill_with_identity(),
         }
         derivative
+    }
+}
+
+/// Subtracts `factor factor^T` from a symmetric matrix of which blocks on and above the diagonal
+/// count: half the work of the whole product.
+fn subtract_square(matrix: &mut DMatrix<f64>, factor: &DMatrix<f64>) {
+    let n = matrix.ncols();
+    for first in (0..n).step_by(PANEL) {
+        let width = PANEL.min(n - first);
+        let rows = first + width;
+        let own = factor.rows(first, width).transpose();
+        matrix.view_mut((0, first), (rows, width)).gemm(-1.0, &factor.rows(0, rows), &own, 1.0);
     }
 }
 

@@ -308,8 +308,9 @@ impl SlamFilter {
         state.gyro_bias = mean(block::GYRO_BIAS)?;
         state.accel_bias = mean(block::ACCEL_BIAS)?;
         belief.covariance = covariance.fixed_view::<NAVIGATION, NAVIGATION>(0, 0).into_owned();
-        let finite = means.iter().flatten().chain(covariance.iter()).all(|x| x.is_finite());
-        if !(finite && belief.is_finite()) {
+        let finite = |sound: bool, x: &f64| sound & x.is_finite();
+        let sound = means.iter().flatten().fold(belief.is_finite(), finite);
+        if !covariance.iter().fold(sound, finite) {
             return None;
         }
         let (motion, before) = (self.motion(), self.calibration);
