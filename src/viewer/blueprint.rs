@@ -116,6 +116,9 @@ impl Layout {
         )?;
         self.property(&world, &background())?;
         self.property(&world, &LineGrid3D::new().with_visible(true))?;
+        // By itself the eye takes in the whole map, and a few far points of it leave the body outside.
+        let eye = EyeControls3D::new().with_tracking_entity(scene::ESTIMATE_BODY);
+        self.property(&world, &eye)?;
         for trajectory in scene::TRAJECTORIES {
             self.time_ranges(&world, trajectory, [TIME, FRAME].map(up_to_cursor))?;
         }

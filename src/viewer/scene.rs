@@ -18,9 +18,9 @@ pub(super) const COLOR: &str = "world/estimate/body/camera/image/color";
 pub(super) const DEPTH: &str = "world/estimate/body/camera/image/depth";
 pub(super) const KEYPOINTS: &str = "world/estimate/body/camera/image/keypoints";
 pub(super) const TRAJECTORIES: [&str; 2] = [ESTIMATE_TRAJECTORY, TRUTH_TRAJECTORY];
+pub(super) const ESTIMATE_BODY: &str = "world/estimate/body";
 pub(super) const LOG: &str = "log";
 
-const ESTIMATE_BODY: &str = "world/estimate/body";
 const ESTIMATE_CAMERA: &str = "world/estimate/body/camera";
 const ESTIMATE_TRAJECTORY: &str = "world/estimate/trajectory";
 const COVARIANCE: &str = "world/estimate/covariance";
