@@ -1,6 +1,7 @@
 //! The pipeline that joins front end, map and filter.
 
 mod association;
+mod clock;
 mod event;
 mod health;
 mod init;

@@ -6,6 +6,7 @@ use nalgebra::{Isometry3, Matrix3, Point2, Point3, Translation3, UnitQuaternion,
 use super::association::{
     Association, View, first_reference, in_body, place, point_pair, reference, seek, seen_point,
 };
+use super::clock::ClockWatch;
 use super::health::{Divergence, Health, HealthSummary, Sight};
 use super::init::{Attempt, Evidence, Initializer};
 use super::recognition::{InView, Jump, spread_of_recognition};
@@ -64,6 +65,7 @@ pub struct Odometry {
     /// The last belief that nothing spoke against, and its time.
     sound: Option<(Stamp, Belief)>,
     watch: SensorWatch,
+    clock: ClockWatch,
     /// Of the next frame.
     notes: Vec<Note>,
     last_imu: Option<Stamp>,
@@ -162,6 +164,7 @@ impl Odometry {
             legacy: None,
             sound: None,
             watch: SensorWatch::new(&config.imu),
+            clock: ClockWatch::default(),
             notes: Vec::new(),
             last_imu: None,
             last_frame: None,
@@ -185,6 +188,7 @@ impl Odometry {
         if self.follows(self.last_imu, sample.stamp) {
             self.last_imu = Some(sample.stamp);
             self.notes.extend(self.watch.imu(&sample));
+            self.clock.imu(sample);
             self.imu.push_back(sample);
         }
     }
@@ -209,6 +213,9 @@ impl Odometry {
         self.advance(frame.frame.stamp.offset_by(self.config.camera.time_offset));
         if self.follows(self.last_frame, frame.frame.stamp) {
             self.last_frame = Some(frame.frame.stamp);
+            if self.has_imu {
+                self.clock.frame(self.frame_time(&frame));
+            }
             self.frames.push_back((self.frames_in, frame));
         }
         self.frames_in += 1;
@@ -283,7 +290,8 @@ impl Odometry {
     /// When a frame was taken by the IMU's clock, as far as is known.
     fn frame_time(&self, frame: &FrontEndFrame) -> Stamp {
         let estimated = self.calibration().map(|calibration| calibration.time_offset);
-        frame.frame.stamp.offset_by(estimated.unwrap_or(self.config.camera.time_offset))
+        let offset = estimated.unwrap_or(self.config.camera.time_offset);
+        frame.frame.stamp.offset_by(offset + self.clock.offset())
     }
 
     /// The camera's calibration as estimated, if it is.
@@ -427,7 +435,7 @@ impl Odometry {
         self.stats.imu_gaps += running.propagate_to(
             stamp,
             &mut self.imu,
-            self.watch.is_noisy(stamp),
+            self.watch.is_noisy(stamp) || self.clock.is_in_doubt(),
             &self.config,
             &mut notes,
         );
@@ -445,7 +453,7 @@ impl Odometry {
         let features = &front.extraction.features;
         let detected = features.len();
         let with_depth = features.iter().filter(|feature| feature.depth.is_some()).count();
-        notes.extend(self.watch.frame(stamp, features, view.size));
+        notes.extend(self.watch.frame(front.frame.stamp, features, view.size));
         let mut found = running.look(features, &view, &mut clock, &mut times);
         if let (Some(pose), Some((before, sound))) = (found.pose, &self.sound)
             && running.filter.knows_vertical()
@@ -468,6 +476,9 @@ impl Odometry {
                 found = running.look(features, &view, &mut clock, &mut times);
             }
         }
+        let attitude = found.pose.map(|pose| pose.rotation * body_from_camera.rotation.inverse());
+        let bias = running.filter.belief().state.gyro_bias;
+        let retimed = self.clock.attitude(stamp, attitude, &bias);
         let Found { candidates, mut matches, pose, mut inliers, others } = found;
 
         if let Some(pose) = pose.filter(|_| view.shutter.is_rolling()) {
@@ -526,6 +537,13 @@ impl Odometry {
         let view = View { body_from_camera: &body_from_camera, shutter, ..view };
         let fates = running.grow_map(features, &matches, &inliers, treatment, lost, &view);
         times.map = clock.lap();
+
+        if let Some((offset, note)) = retimed {
+            notes.push(note);
+            running.time = running.time.offset_by(offset);
+            self.imu = self.clock.samples().copied().collect();
+            self.sound = self.sound.map(|(time, belief)| (time.offset_by(offset), belief));
+        }
 
         self.stats.frames_processed += 1;
         let wants_map = self.map_every > 0 && number.is_multiple_of(self.map_every);
@@ -596,6 +614,11 @@ impl Running {
         config: &OdometryConfig,
         notes: &mut Vec<Note>,
     ) -> u64 {
+        // After the belief has been timed anew some are behind it.
+        while let Some(sample) = imu.pop_front_if(|sample| sample.stamp <= self.time) {
+            self.last_imu = Some(sample);
+            self.last_sample = Some(sample.stamp);
+        }
         let Some(mut last) = self.last_imu.or_else(|| imu.front().copied()) else {
             self.filter.coast(stamp.seconds_since(self.time));
             self.time = stamp;
