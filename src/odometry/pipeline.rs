@@ -14,7 +14,7 @@ use super::report::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
 use super::rest::RestDetector;
-use super::restart::{Legacy, Spread};
+use super::restart::{BIAS_FACTOR, Legacy, Spread};
 use super::shutter::{Shutter, given_pose};
 use super::truth::TruthTrack;
 use super::watch::{Agreement, SensorWatch};
@@ -24,7 +24,7 @@ use crate::filter::{
     Calibration, FilterConfig, FilterKind, KnownAttitude, MapTreatment, PointState, SeenPoint,
     UpdateOutcome, VisualInertialFilter, point_by_pose,
 };
-use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, Stamp};
+use crate::inertial::{Belief, ImuConfig, ImuSample, NavCovariance, Propagator, Stamp, block};
 use crate::map::{Map, MapPoint, Sighting};
 use crate::so3::ProperSvd;
 use crate::vision::{
@@ -121,6 +121,8 @@ struct Running {
     told_gap_after: Option<Stamp>,
     /// The start, until the vertical is known.
     vertical_sought_since: Option<Stamp>,
+    /// Whether what is known of the accelerometer's bias is what was assumed at the start.
+    levelling_counts: bool,
     rest: RestDetector,
     /// What is not known of where this start is in the world of the first one. It is no part of
     /// the belief: nothing that is measured can tell of it.
@@ -383,6 +385,7 @@ impl Odometry {
             blind_frames: 0,
             last_sample: last_imu.map(|sample| sample.stamp),
             told_gap_after: None,
+            levelling_counts: true,
             rest: RestDetector::new(&self.config.standstill, &self.config.imu),
             spread: Spread::default(),
         });
@@ -516,7 +519,14 @@ impl Odometry {
             others,
             contradicted: updated.is_some_and(|outcome| outcome.contradicts()),
         };
-        notes.extend(self.watch.agreement(stamp, agreement, &belief.state));
+        notes.extend(self.watch.agreement(stamp, agreement));
+        notes.extend(self.watch.gyro_bias(stamp, &belief.state));
+        notes.extend(self.watch.accel_bias(stamp, &belief.state));
+        if self.watch.accel_bias_lasts(stamp) && !self.watch.is_noisy(stamp) {
+            running.doubt_levelling(stamp, &self.config.imu);
+        }
+        running.weigh_levelling(agreement.contradicted, &self.config.imu);
+        let belief = running.filter.belief();
         let innovation = updated.map(|outcome| outcome.innovation);
         notes.extend(self.health.judge(stamp, belief, innovation));
         if self.health.is_sound(innovation) {
@@ -671,6 +681,24 @@ impl Running {
         let text = format!("IMU gap of {length:.3} s after {after} s: bridged by vision");
         notes.push(Note { level: NoteLevel::Warning, text });
         true
+    }
+
+    /// Doubts the levelling by an accelerometer whose bias proves to be none of its kind.
+    fn doubt_levelling(&mut self, stamp: Stamp, imu: &ImuConfig) {
+        let accel_bias_sd = BIAS_FACTOR * imu.accel_bias_sd;
+        if std::mem::take(&mut self.levelling_counts) && self.filter.doubt_levelling(accel_bias_sd)
+        {
+            self.vertical_sought_since = Some(stamp);
+        }
+    }
+
+    /// The levelling counts no more once the bias is known much better than at the start, or may
+    /// have changed since.
+    fn weigh_levelling(&mut self, contradicted: bool, imu: &ImuConfig) {
+        let covariance = &self.filter.belief().covariance;
+        let bias = covariance.fixed_view::<3, 3>(block::ACCEL_BIAS, block::ACCEL_BIAS);
+        let found = bias.diagonal().max().sqrt() < 0.5 * imu.accel_bias_sd;
+        self.levelling_counts &= !found && !contradicted;
     }
 
     /// Tells that the vertical is known when it has become so.

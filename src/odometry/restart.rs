@@ -117,8 +117,8 @@ impl Legacy {
     }
 }
 
-/// On the standard deviation of the biases of a start.
-const BIAS_FACTOR: f64 = 10.0;
+/// On the standard deviation of the biases of a start, where they are found to be none of the sensor's.
+pub(super) const BIAS_FACTOR: f64 = 10.0;
 
 /// The turn about the vertical that brings `from` closest to `to`.
 fn heading_between(to: &UnitQuaternion<f64>, from: &UnitQuaternion<f64>) -> UnitQuaternion<f64> {

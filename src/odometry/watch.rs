@@ -27,6 +27,9 @@ const PARTS: (usize, usize) = (4, 3);
 const OBSTRUCTED: f64 = 0.7;
 /// A bias beyond this many of its standard deviations at the start is no bias of this sensor.
 const UNUSUAL_BIAS: f64 = 5.0;
+/// A bias that is unusual for so long is what it is, s: that of the gyroscope, which turns everything
+/// while it is being found, is then known.
+const LASTING: f64 = 0.5;
 /// What no hand and no vehicle does, rad/s and m/s^2: units are wrong, or the sensor is.
 pub(super) const MAX_RATE: f64 = 20.0;
 pub(super) const MAX_FORCE: f64 = 150.0;
@@ -40,8 +43,9 @@ const SHARE_ASTRAY: f64 = 0.4;
 const FRAMES_ASTRAY: u32 = 2;
 
 /// Speaks once when a condition is first met, and again only after it was absent for a while.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Alarm {
+    since: Option<Stamp>,
     last: Option<Stamp>,
 }
 
@@ -52,6 +56,9 @@ impl Alarm {
         }
         let new = self.last.is_none_or(|last| stamp.seconds_since(last) > QUIET);
         self.last = Some(stamp);
+        if new {
+            self.since = Some(stamp);
+        }
         new.then(|| Note { level: NoteLevel::Warning, text: text() })
     }
 }
@@ -161,7 +168,8 @@ pub(super) struct SensorWatch {
     moving: Alarm,
     frames_astray: u32,
     contradiction: Alarm,
-    bias: Alarm,
+    gyro_bias: Alarm,
+    accel_bias: Alarm,
 }
 
 /// What matching and conditioning made of a frame.
@@ -190,7 +198,8 @@ impl SensorWatch {
             moving: Alarm::default(),
             frames_astray: 0,
             contradiction: Alarm::default(),
-            bias: Alarm::default(),
+            gyro_bias: Alarm::default(),
+            accel_bias: Alarm::default(),
         }
     }
 
@@ -268,12 +277,7 @@ impl SensorWatch {
         stamps.into_iter().chain(obstructed)
     }
 
-    pub fn agreement(
-        &mut self,
-        stamp: Stamp,
-        seen: Agreement,
-        state: &NavState,
-    ) -> impl Iterator<Item = Note> {
+    pub fn agreement(&mut self, stamp: Stamp, seen: Agreement) -> impl Iterator<Item = Note> {
         let Agreement { matches, inliers, others, contradicted } = seen;
         let astray = matches.saturating_sub(inliers) as f64;
         let moves = others >= MANY_ASTRAY && others as f64 >= SHARE_ASTRAY * astray;
@@ -289,19 +293,43 @@ impl SensorWatch {
                 "IMU and images contradict each other at {stamp} s: the prediction is distrusted"
             )
         });
-        let beyond = |bias: f64, sd: f64| sd > 0.0 && bias > UNUSUAL_BIAS * sd;
-        let (gyro, accel) = (state.gyro_bias.amax(), state.accel_bias.amax());
-        // Without an IMU the biases carry the motion of the constant-velocity model.
-        let unusual = self.force.is_some()
-            && (beyond(gyro, self.imu.gyro_bias_sd) || beyond(accel, self.imu.accel_bias_sd));
-        let bias = self.bias.tell(stamp, unusual, || {
-            format!(
-                "unusual bias at {stamp} s: gyroscope {gyro:.3} rad/s, accelerometer {accel:.2} \
-                 m/s^2, beyond {UNUSUAL_BIAS} times the configured standard deviations"
-            )
-        });
-        moving.into_iter().chain(contradiction).chain(bias)
+        moving.into_iter().chain(contradiction)
     }
+
+    // Without an IMU the biases carry the motion of the constant-velocity model.
+
+    pub fn gyro_bias(&mut self, stamp: Stamp, state: &NavState) -> Option<Note> {
+        let (bias, sd) = (state.gyro_bias.amax(), self.imu.gyro_bias_sd);
+        self.gyro_bias.tell(stamp, self.force.is_some() && is_unusual(bias, sd), || {
+            unusual_bias(stamp, &format!("gyroscope {bias:.3} rad/s"))
+        })
+    }
+
+    pub fn accel_bias(&mut self, stamp: Stamp, state: &NavState) -> Option<Note> {
+        let (bias, sd) = (state.accel_bias.amax(), self.imu.accel_bias_sd);
+        self.accel_bias.tell(stamp, self.force.is_some() && is_unusual(bias, sd), || {
+            unusual_bias(stamp, &format!("accelerometer {bias:.2} m/s^2"))
+        })
+    }
+
+    /// Whether the accelerometer's bias has been unusual for long enough for all else to have
+    /// settled.
+    pub fn accel_bias_lasts(&self, stamp: Stamp) -> bool {
+        let Alarm { since, last } = self.accel_bias;
+        last == Some(stamp) && since.is_some_and(|since| stamp.seconds_since(since) > LASTING)
+    }
+}
+
+/// Of the largest component of a bias.
+fn is_unusual(bias: f64, sd: f64) -> bool {
+    sd > 0.0 && bias > UNUSUAL_BIAS * sd
+}
+
+fn unusual_bias(stamp: Stamp, whose: &str) -> String {
+    format!(
+        "unusual bias at {stamp} s: {whose}, beyond {UNUSUAL_BIAS} times the configured standard \
+         deviation"
+    )
 }
 
 /// Parts of the image in which there are features.
@@ -372,20 +400,27 @@ mod tests {
             gyro_bias: Vector3::zeros(),
             accel_bias: Vector3::zeros(),
         };
-        let mut told = |inliers, contradicted, state: &NavState| -> Vec<String> {
+        let mut told = |inliers, contradicted| -> Vec<String> {
             let others = if inliers < 80 { 40 } else { 10 };
             let seen = Agreement { matches: 100, inliers, others, contradicted };
-            watch.agreement(at(0.0), seen, state).map(|note| note.text).collect()
+            watch.agreement(at(0.0), seen).map(|note| note.text).collect()
         };
-        assert!(told(90, false, &state).is_empty());
-        assert!(told(40, false, &state).is_empty());
-        assert!(told(40, false, &state)[0].contains("40 on another"));
-        assert!(told(40, true, &state)[0].contains("contradict"));
+        assert!(told(90, false).is_empty());
+        assert!(told(40, false).is_empty());
+        assert!(told(40, false)[0].contains("40 on another"));
+        assert!(told(40, true)[0].contains("contradict"));
+        assert_eq!(watch.gyro_bias(at(0.0), &state), None);
+        assert_eq!(watch.accel_bias(at(0.0), &state), None);
         state.gyro_bias.z = -6.0 * ImuConfig::default().gyro_bias_sd;
-        assert!(told(90, false, &state)[0].contains("unusual bias"));
+        assert!(watch.gyro_bias(at(0.0), &state).unwrap().text.contains("gyroscope 0.060"));
+        assert_eq!(watch.accel_bias(at(0.0), &state), None);
+        state.accel_bias.x = 6.0 * ImuConfig::default().accel_bias_sd;
+        assert!(watch.accel_bias(at(0.0), &state).unwrap().text.contains("accelerometer 0.60"));
+        assert!(!watch.accel_bias_lasts(at(0.0)));
+        assert_eq!(watch.accel_bias(at(0.6), &state), None);
+        assert!(watch.accel_bias_lasts(at(0.6)) && !watch.accel_bias_lasts(at(0.7)));
 
         let mut without_imu = SensorWatch::new(&ImuConfig::default());
-        let seen = Agreement { matches: 100, inliers: 90, others: 0, contradicted: false };
-        assert_eq!(without_imu.agreement(at(0.0), seen, &state).count(), 0);
+        assert_eq!(without_imu.gyro_bias(at(0.0), &state), None);
     }
 }

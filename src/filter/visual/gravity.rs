@@ -31,8 +31,9 @@ pub(super) struct UnknownGravity {
 }
 
 impl UnknownGravity {
-    /// Standard deviation of the direction below which it counts as known, rad.
-    pub const SETTLED: f64 = 0.05;
+    /// Standard deviation of the direction about any axis below which it counts as known, rad. Of
+    /// what a larger one makes of second order, a precise bias would know more than there is.
+    pub const SETTLED: f64 = 0.02;
 
     /// The mean and covariance of a vector of the given magnitude and any direction.
     pub fn new(magnitude: f64) -> Self {
@@ -43,6 +44,14 @@ impl UnknownGravity {
             cross: ByGravity::zeros(),
             transition: ByGravity::zeros(),
         }
+    }
+
+    /// Around a mean that has been taken for certain, with the covariances that [`Self::follow`]
+    /// takes.
+    pub fn around(mean: Vector3<f64>, covariance: &DMatrix<f64>) -> Self {
+        let mut gravity = Self { mean, ..Self::new(mean.norm()) };
+        gravity.follow(covariance);
+        gravity
     }
 
     /// Takes its covariances from that of the whole state, where it follows the navigation part.
@@ -82,7 +91,12 @@ impl UnknownGravity {
     }
 
     pub fn is_settled(&self) -> bool {
-        self.variance_across().sqrt() < Self::SETTLED * self.magnitude
+        let across = self
+            .mean
+            .try_normalize(0.0)
+            .map_or_else(Matrix3::identity, |up| Matrix3::identity() - up * up.transpose());
+        let largest = (across * self.covariance * across).symmetric_eigenvalues().max();
+        largest.sqrt() < Self::SETTLED * self.magnitude
     }
 
     /// Of the attitude in an upright world: the concentration of the von Mises-Fisher density

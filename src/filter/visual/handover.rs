@@ -94,6 +94,10 @@ impl VisualInertialFilter for HandOver {
         self.filter_mut().rest(rest)
     }
 
+    fn doubt_levelling(&mut self, accel_bias_sd: f64) -> bool {
+        self.filter_mut().doubt_levelling(accel_bias_sd)
+    }
+
     fn passed(&self) -> &[bool] {
         self.filter().passed()
     }

@@ -348,6 +348,14 @@ pub trait VisualInertialFilter: Send {
     /// follows.
     fn rest(&mut self, rest: &Rest) -> bool;
 
+    /// Takes the accelerometer's bias for one of standard deviation `accel_bias_sd` (m/s^2), far
+    /// more than was thought, by which the world was levelled wrongly: the direction of gravity
+    /// becomes as uncertain, together with the bias. False, and no change, if the filter cannot
+    /// estimate it or already does.
+    fn doubt_levelling(&mut self, _accel_bias_sd: f64) -> bool {
+        false
+    }
+
     /// For each pair offered to the last update whether it passed the gate.
     fn passed(&self) -> &[bool];
 

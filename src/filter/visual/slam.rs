@@ -594,6 +594,33 @@ impl VisualInertialFilter for SlamFilter {
         self.condition_on_rest(rest).is_some()
     }
 
+    /// Gravity enters the state with an error that the accelerometer's bias makes up for.
+    fn doubt_levelling(&mut self, accel_bias_sd: f64) -> bool {
+        let mean = *self.propagator.gravity();
+        let doubtful = self.coordinates == Coordinates::Group && self.gravity.is_none();
+        if !doubtful || mean.norm() == 0.0 {
+            return false;
+        }
+        self.synchronize();
+        let variance = accel_bias_sd.powi(2);
+        let rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
+        let covariance = std::mem::take(&mut self.covariance);
+        let mut covariance =
+            covariance.insert_rows(NAVIGATION, 3, 0.0).insert_columns(NAVIGATION, 3, 0.0);
+        let mut add = |row: usize, column: usize, value: Matrix3<f64>| {
+            let mut part = covariance.fixed_view_mut::<3, 3>(row, column);
+            part += value * variance;
+        };
+        add(NAVIGATION, NAVIGATION, Matrix3::identity());
+        add(block::ACCEL_BIAS, block::ACCEL_BIAS, Matrix3::identity());
+        add(NAVIGATION, block::ACCEL_BIAS, *rotation.matrix());
+        add(block::ACCEL_BIAS, NAVIGATION, rotation.matrix().transpose());
+        self.belief.covariance = covariance.fixed_view::<NAVIGATION, NAVIGATION>(0, 0).into_owned();
+        self.gravity = Some(UnknownGravity::around(mean, &covariance));
+        self.covariance = covariance;
+        true
+    }
+
     fn passed(&self) -> &[bool] {
         &self.passed
     }
@@ -601,11 +628,17 @@ impl VisualInertialFilter for SlamFilter {
     fn matrix_fisher(&self) -> Option<ProperSvd> {
         match (self.coordinates, &self.gravity) {
             (Coordinates::Additive, _) => None,
-            (Coordinates::Group, Some(gravity)) => self.of_vertical(gravity.concentration()),
+            (Coordinates::Group, Some(gravity)) if self.heading_is_free => {
+                self.of_vertical(gravity.concentration())
+            }
             (Coordinates::Group, None) if self.heading_is_free => {
                 self.of_vertical(self.tilt_concentration())
             }
-            (Coordinates::Group, None) => self.belief.attitude().map(|attitude| *attitude.svd()),
+            (Coordinates::Group, _) => {
+                let covariance = self.reported_covariance();
+                let upright = Belief { covariance, ..self.belief };
+                upright.attitude().map(|attitude| *attitude.svd())
+            }
         }
     }
 
@@ -765,9 +798,9 @@ impl PointState for SlamFilter {
 mod tests {
     use super::*;
     use crate::filter::FilterKind;
-    use crate::inertial::{ImuConfig, NavState, Stamp};
+    use crate::inertial::{ImuConfig, NavState, Stamp, attitude_from_gravity};
     use approx::assert_relative_eq;
-    use nalgebra::SVector;
+    use nalgebra::{SVector, Translation3};
     use proptest::prelude::*;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
@@ -915,6 +948,76 @@ mod tests {
         };
         let known = in_world(&prior);
         assert_relative_eq!(in_world(after), known, epsilon = 0.02 * known.norm());
+    }
+
+    /// The body rests for a second, levelled by an accelerometer with a bias of ten times its
+    /// standard deviation, and then swings about two axes, which tells gravity from the bias.
+    #[test]
+    fn a_doubted_levelling_stays_uncertain_until_the_body_turns() {
+        let run = |doubts: bool| {
+            let mut rng = ChaCha8Rng::seed_from_u64(29);
+            let gravity = ImuConfig::default().gravity;
+            let bias = Vector3::new(1.0, -1.0, 1.0);
+            let axis = |t: f64| if t < 2.0 { Vector3::y() } else { Vector3::z() };
+            let phase = |t: f64| std::f64::consts::TAU * (t - 1.0).max(0.0);
+            let turn = |t: f64| UnitQuaternion::new(axis(t) * (0.4 - 0.4 * phase(t).cos()));
+            let start = UnitQuaternion::new(Vector3::new(0.3, -0.8, 0.2));
+            let up = |t: f64| (start * turn(t)).inverse() * Vector3::z();
+            let sample = |t: f64| ImuSample {
+                stamp: Stamp::default().offset_by(t),
+                angular_velocity: axis(t) * (0.4 * std::f64::consts::TAU * phase(t).sin()),
+                specific_force: up(t) * gravity + bias,
+            };
+            let levelled = attitude_from_gravity(&sample(0.0).specific_force).unwrap();
+            let state = NavState {
+                world_from_body: Isometry3::from_parts(Translation3::identity(), levelled),
+                velocity: Vector3::zeros(),
+                gyro_bias: Vector3::zeros(),
+                accel_bias: Vector3::zeros(),
+            };
+            let mut covariance = NavCovariance::identity() * 1e-4;
+            covariance.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(0.087f64.powi(2));
+            covariance.fixed_view_mut::<3, 3>(12, 12).fill_diagonal(0.01);
+            let mut mfgs = filter(FilterKind::Mfgs, Belief { state, covariance });
+            let landmarks: Vec<_> = (0..15).map(|_| vector(&mut rng, 3.0)).collect();
+            let noise = Matrix3::identity() * 0.005f64.powi(2);
+            let mut measure = |t: f64| -> Vec<SeenPoint> {
+                let see =
+                    |(id, l)| seen(id, turn(t).inverse() * l + normal(&mut rng) * 0.005, noise);
+                (0..).zip(&landmarks).map(see).collect()
+            };
+            for point in measure(0.0) {
+                assert!(mfgs.point_state().unwrap().admit(&point));
+            }
+            let mut tilts = Vec::new();
+            for frame in 0..60 {
+                let t = |step: usize| (frame * 10 + step) as f64 * 0.005;
+                for step in 0..10 {
+                    assert!(mfgs.propagate(&sample(t(step)), &sample(t(step + 1))));
+                }
+                assert!(mfgs.point_state().unwrap().measure(&measure(t(10))).is_some());
+                if doubts && frame == 3 {
+                    assert!(mfgs.doubt_levelling(1.0) && !mfgs.doubt_levelling(1.0));
+                }
+                let axis = mfgs.belief().state.world_from_body.rotation.inverse() * Vector3::z();
+                let error = axis.cross(&up(t(10)));
+                let covariance = mfgs.reported_covariance().fixed_view::<3, 3>(0, 0).into_owned();
+                tilts.push((error, covariance));
+            }
+            (mfgs.knows_vertical(), mfgs.belief().state.accel_bias - bias, tilts)
+        };
+        let squared = |(error, covariance): &(Vector3<f64>, Matrix3<f64>)| {
+            error.dot(&(covariance.cholesky().unwrap().inverse() * error))
+        };
+        let (_, _, tilts) = run(false);
+        assert!(squared(&tilts[19]) > 40.0, "{}", squared(&tilts[19]));
+
+        let (known, bias_error, tilts) = run(true);
+        let (doubt, at_rest) = (2.0 / ImuConfig::default().gravity.powi(2), tilts[19].1.trace());
+        assert!(at_rest > 0.999 * doubt, "{at_rest}");
+        assert!(tilts.iter().skip(4).all(|tilt| squared(tilt) < 14.0));
+        let error = tilts[59].0.norm();
+        assert!(known && bias_error.norm() < 0.1 && error < 0.01, "{known} {bias_error} {error}");
     }
 
     /// The rival's linearisation follows its estimates of the points and so finds information
