@@ -73,9 +73,9 @@ pub struct Args {
 #[derive(Debug, Clone, clap::Args)]
 pub struct Settings {
     /// mfgd, mekfd (map fixed), mfgr, mekfr (map points uncertain), mfgs, mekfs (map points
-    /// correlated with the pose) [default: mfgs, without an IMU mfgr].
-    #[arg(long, value_name = "NAME")]
-    filter: Option<FilterKind>,
+    /// correlated with the pose).
+    #[arg(long, value_name = "NAME", default_value_t)]
+    filter: FilterKind,
     /// auto, static, truth, unknown-heading or unknown [default: init.mode of the configuration].
     #[arg(long, value_name = "MODE")]
     init: Option<InitMode>,
@@ -202,7 +202,7 @@ impl Plan<'_> {
         }
         let mut front_end =
             OrbExtractor::new(&self.config.features, &self.config.camera, &self.config.depth)?;
-        let filter = self.settings.filter.unwrap_or(FilterKind::recommended(self.summary.has_imu));
+        let filter = self.settings.filter;
         let contents = Contents {
             name: format!("{}, {}, seed {}", self.log.display(), filter, self.settings.seed),
             truth: self.truth.is_some() || self.summary.has_truth,
