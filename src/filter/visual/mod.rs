@@ -434,6 +434,10 @@ pub trait PointState {
     /// Marginalizes a point out: what the belief learned by it stays. False if it is not held.
     fn release(&mut self, id: u64) -> bool;
 
+    /// Takes the time of the belief to be uncertain by this standard deviation (s), while the body moves
+    /// on.
+    fn blur_time(&mut self, sd: f64);
+
     /// Moves the body by `way`, in body coordinates, which is known as well as `spread` says, and leaves
     /// it at rest there. Points, biases and calibration stay. The vertical must be known.
     fn carry_off(&mut self, way: &Isometry3<f64>, spread: &MotionSpread);
