@@ -3,6 +3,7 @@
 mod association;
 mod clock;
 mod event;
+mod gyroscope;
 mod health;
 mod init;
 mod pipeline;

@@ -7,6 +7,7 @@ use super::association::{
     Association, View, first_reference, in_body, place, point_pair, reference, seek, seen_point,
 };
 use super::clock::ClockWatch;
+use super::gyroscope::GyroscopeWatch;
 use super::health::{Divergence, Health, HealthSummary, Sight};
 use super::init::{Attempt, Evidence, Initializer};
 use super::recognition::{InView, Jump, spread_of_recognition};
@@ -66,6 +67,7 @@ pub struct Odometry {
     sound: Option<(Stamp, Belief)>,
     watch: SensorWatch,
     clock: ClockWatch,
+    gyroscope: GyroscopeWatch,
     /// Of the next frame.
     notes: Vec<Note>,
     last_imu: Option<Stamp>,
@@ -100,9 +102,6 @@ const PATIENCE: f64 = 1.0;
 
 /// Fewer matches than this may agree on a pose by chance.
 const FEW_ASTRAY: usize = 30;
-
-/// Frames after which the points of a new map lie where they are, so that others move.
-const SETTLED: u64 = 30;
 
 /// What exists once the filter has started.
 struct Running {
@@ -170,6 +169,7 @@ impl Odometry {
             sound: None,
             watch: SensorWatch::new(&config.imu),
             clock: ClockWatch::default(),
+            gyroscope: GyroscopeWatch::default(),
             notes: Vec::new(),
             last_imu: None,
             last_frame: None,
@@ -441,13 +441,11 @@ impl Odometry {
         self.stats.imu_gaps += running.propagate_to(
             stamp,
             &mut self.imu,
+            &mut self.gyroscope,
             self.watch.is_noisy(stamp) || self.clock.is_in_doubt(),
             &self.config,
             &mut notes,
         );
-        if let Some(points) = running.filter.point_state().filter(|_| self.has_imu) {
-            points.blur_time(self.clock.jitter());
-        }
         let mut view = View {
             config: &self.config,
             camera: &self.camera,
@@ -470,10 +468,10 @@ impl Odometry {
         {
             let world_from_body = pose * body_from_camera.inverse();
             let after = stamp.seconds_since(*before);
-            let in_sight = self.health.is_lost_in_sight();
-            let jump = Jump::between(&sound.state, &world_from_body, after, lost && !in_sight);
+            let in_the_dark = lost && !self.health.is_lost_in_sight();
+            let jump = Jump::between(&sound.state, &world_from_body, after, in_the_dark);
             let seen =
-                (in_sight || jump.is_some()).then(|| running.in_view(&pose, front, &found, &view));
+                (lost || jump.is_some()).then(|| running.in_view(&pose, front, &found, &view));
             if let Some(seen) = seen.filter(|seen| !seen.confirms()) {
                 tracing::debug!("at {stamp} s {seen:?} do not confirm a pose");
                 found.pose = None;
@@ -486,6 +484,9 @@ impl Odometry {
             }
         }
         let attitude = found.pose.map(|pose| pose.rotation * body_from_camera.rotation.inverse());
+        if let Some(attitude) = attitude.filter(|_| self.has_imu) {
+            notes.extend(self.gyroscope.attitude(stamp, attitude));
+        }
         let bias = running.filter.belief().state.gyro_bias;
         let retimed = self.clock.attitude(stamp, attitude, &bias);
         let Found { candidates, mut matches, pose, mut inliers, others } = found;
@@ -626,6 +627,7 @@ impl Running {
         &mut self,
         stamp: Stamp,
         imu: &mut VecDeque<ImuSample>,
+        gyroscope: &mut GyroscopeWatch,
         noisy: bool,
         config: &OdometryConfig,
         notes: &mut Vec<Note>,
@@ -647,13 +649,16 @@ impl Running {
             let until = next.map_or(stamp, |sample| sample.stamp);
             let gap = self.gap_before(until, config.imu.max_gap);
             gaps += u64::from(self.tell_gap(gap, notes));
-            self.filter.set_imu_gap(gap.is_some() || noisy);
+            self.filter.set_imu_gap(gap.is_some() || noisy || gyroscope.is_wrong());
             let reached = next.filter(|sample| sample.stamp <= stamp);
             let to = match (reached, next) {
                 (Some(sample), _) => sample,
                 (None, Some(next)) => ImuSample::between(&last, &next, stamp),
                 (None, None) => ImuSample { stamp, ..last },
             };
+            let bias = self.filter.belief().state.gyro_bias;
+            let measured = to;
+            let to = gyroscope.reading(to, to.stamp.seconds_since(last.stamp), &bias);
             if !self.filter.propagate(&last, &to) {
                 let text = format!("IMU samples up to {} s left out: no finite belief", to.stamp);
                 notes.push(Note { level: NoteLevel::Warning, text });
@@ -664,7 +669,7 @@ impl Running {
             }
             imu.pop_front();
             self.last_sample = Some(to.stamp);
-            self.rest.push_imu(to);
+            self.rest.push_imu(measured);
         }
         self.last_imu = Some(last);
         self.time = stamp;
@@ -918,9 +923,7 @@ impl Running {
         let astray: Vec<_> = (correspondences.iter().zip(membership(&near, matches.len())))
             .filter_map(|(correspondence, near)| (!near).then_some(*correspondence))
             .collect();
-        let suspect = self.seeing_frames >= SETTLED
-            && astray.len() >= FEW_ASTRAY
-            && 4 * astray.len() > matches.len();
+        let suspect = astray.len() >= FEW_ASTRAY && 4 * astray.len() > matches.len();
         let others = agree(if suspect { &astray } else { &[] });
         (Some(found), others.map_or(0, |others| others.inliers.len()))
     }

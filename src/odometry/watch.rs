@@ -15,6 +15,8 @@ const REGULAR: std::ops::Range<f64> = 0.5..1.7;
 const LEARNING: u32 = 20;
 /// Noise of the IMU this many times the usual one is a burst.
 const NOISE_BURST: f64 = 4.0;
+/// A gyroscope with so many times the noise that its model has is another one, or in other units.
+const NOISE_MODEL: f64 = 8.0;
 /// For so long after a burst was noticed samples count as noisy, s.
 const NOISE_MEMORY: f64 = 0.15;
 /// For so long after IMU and images contradicted each other samples count as noisy, s.
@@ -39,7 +41,7 @@ const FORCE_FACTOR: f64 = 1.6;
 /// With at least so many matches, and this share of those that disagree with the camera's pose,
 /// agreeing on another one in so many frames in a row, something moves.
 const MANY_ASTRAY: usize = 30;
-const SHARE_ASTRAY: f64 = 0.2;
+const SHARE_ASTRAY: f64 = 0.4;
 const FRAMES_ASTRAY: u32 = 2;
 
 /// Speaks once when a condition is first met, and again only after it was absent for a while.
@@ -127,7 +129,15 @@ struct NoiseLevel {
 }
 
 impl NoiseLevel {
-    fn see(&mut self, stamp: Stamp, value: Vector3<f64>, stream: &str) -> Option<Note> {
+    /// `modelled`: the standard deviation that the configuration says, beyond many times of which
+    /// none is usual.
+    fn see(
+        &mut self,
+        stamp: Stamp,
+        value: Vector3<f64>,
+        modelled: f64,
+        stream: &str,
+    ) -> Option<Note> {
         let [before, last] = self.last;
         self.last = [last, value];
         self.seen += 1;
@@ -140,13 +150,17 @@ impl NoiseLevel {
             return None;
         }
         let level = (self.squares.drain(..).sum::<f64>() / NOISE_SAMPLES as f64).sqrt();
-        let usual = self.usual.value();
-        let Some(usual) = usual.filter(|usual| level > NOISE_BURST * usual) else {
-            self.usual.learn(level);
-            return None;
+        let usual = self.usual.value().filter(|usual| level > NOISE_BURST * usual);
+        let (than, what) = match usual {
+            Some(usual) => (usual, "usual"),
+            None if level > NOISE_MODEL * modelled => (modelled, "configured one"),
+            None => {
+                self.usual.learn(level);
+                return None;
+            }
         };
         self.alarm.tell(stamp, true, || {
-            format!("noise of the {stream} at {stamp} s is {:.0} times the usual", level / usual)
+            format!("noise of the {stream} at {stamp} s is {:.0} times the {what}", level / than)
         })
     }
 }
@@ -209,9 +223,13 @@ impl SensorWatch {
             self.gyroscope.seen = 0;
             self.accelerometer.seen = 0;
         }
+        let interval = self.imu_stamps.last.map_or(f64::INFINITY, |last| stamp.seconds_since(last));
         let stamps = self.imu_stamps.see(stamp, "IMU", self.imu.max_gap);
-        let gyroscope = self.gyroscope.see(stamp, sample.angular_velocity, "gyroscope");
-        let accelerometer = self.accelerometer.see(stamp, sample.specific_force, "accelerometer");
+        let modelled = Some(self.imu.gyro_noise / interval.sqrt()).filter(|sd| *sd > 0.0);
+        let modelled = modelled.unwrap_or(f64::INFINITY);
+        let gyroscope = self.gyroscope.see(stamp, sample.angular_velocity, modelled, "gyroscope");
+        let accelerometer =
+            self.accelerometer.see(stamp, sample.specific_force, f64::INFINITY, "accelerometer");
         let implausible = self.implausible(sample);
         stamps.into_iter().chain(gyroscope).chain(accelerometer).chain(implausible)
     }
@@ -380,9 +398,18 @@ mod tests {
             let motion = if k > 500 { 3.0 * (6.0 * (t - 2.5)).sin().powi(2) } else { 0.0 };
             let alternating = if k % 2 == 0 { noise } else { -noise };
             let value = Vector3::new(motion + alternating, 0.0, 9.8);
-            told.extend(level.see(at(t), value, "accelerometer").map(|_| k));
+            told.extend(level.see(at(t), value, f64::INFINITY, "accelerometer").map(|_| k));
         }
         assert!(told.len() == 1 && (1000..1030).contains(&told[0]), "{told:?}");
+
+        let mut level = NoiseLevel::default();
+        let mut tell = |k: i32, modelled: f64| {
+            let value = Vector3::new(if k % 2 == 0 { 0.02 } else { -0.02 }, 0.0, 0.1);
+            level.see(at(f64::from(k) * 0.005), value, modelled, "gyroscope")
+        };
+        // The second difference of alternating values is larger than that of noise of their size.
+        assert!((0..50).all(|k| tell(k, 0.01).is_none()));
+        assert!((50..70).any(|k| tell(k, 1e-3).is_some_and(|n| n.text.contains("configured"))));
     }
 
     #[test]
