@@ -214,7 +214,7 @@ fn real_recordings_are_followed_better_than_by_frame_to_frame_peers() {
         [("tum_fr1_rpy", 270, 0.108), ("seven_scenes_redkitchen", 150, 0.023)]
     {
         let Some(log) = recording(name) else { continue };
-        for filter in FILTERS {
+        for filter in FILTERS.into_iter().chain(["mfgs"]) {
             let metrics = json(&["replay", text(&log), "--filter", filter, "--json"]);
             assert_eq!(metrics["frames_processed"], frames, "{name} {filter}");
             assert!(rmse(&metrics) < best_peer, "{name} {filter}: {}", rmse(&metrics));

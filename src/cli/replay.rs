@@ -7,7 +7,7 @@ use nalgebra::Isometry3;
 use super::terminal::{INTERRUPTED, catch_interrupts, progress};
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Fault, LogSummary};
-use mfg_vio::filter::FilterKind;
+use mfg_vio::filter::{FilterKind, MapTreatment};
 #[cfg(feature = "viewer")]
 use mfg_vio::inertial::ImuSample;
 use mfg_vio::odometry::{InitMode, StepReport};
@@ -73,9 +73,9 @@ pub struct Args {
 #[derive(Debug, Clone, clap::Args)]
 pub struct Settings {
     /// mfgd, mekfd (map fixed), mfgr, mekfr (map points uncertain), mfgs, mekfs (map points
-    /// correlated with the pose) [default: mfgs, without an IMU mfgr].
-    #[arg(long, value_name = "NAME")]
-    filter: Option<FilterKind>,
+    /// correlated with the pose).
+    #[arg(long, value_name = "NAME", default_value_t)]
+    filter: FilterKind,
     /// auto, static, truth, unknown-heading or unknown [default: init.mode of the configuration].
     #[arg(long, value_name = "MODE")]
     init: Option<InitMode>,
@@ -200,9 +200,12 @@ impl Plan<'_> {
         if let Some(out) = &self.out {
             std::fs::create_dir_all(out).with_context(|| format!("{}", out.display()))?;
         }
-        let mut front_end =
-            OrbExtractor::new(&self.config.features, &self.config.camera, &self.config.depth)?;
-        let filter = self.settings.filter.unwrap_or(FilterKind::recommended(self.summary.has_imu));
+        let filter = self.settings.filter;
+        let seeks = self.config.search.seek_state_points
+            && filter.map_treatment() == MapTreatment::Correlated;
+        let config = &self.config;
+        let mut front_end = OrbExtractor::new(&config.features, &config.camera, &config.depth)?
+            .keeping_pyramid(seeks);
         let contents = Contents {
             name: format!("{}, {}, seed {}", self.log.display(), filter, self.settings.seed),
             truth: self.truth.is_some() || self.summary.has_truth,

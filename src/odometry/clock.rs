@@ -8,14 +8,21 @@ use nalgebra::{UnitQuaternion, Vector3};
 use super::{Note, NoteLevel};
 use crate::inertial::{ImuSample, Stamp};
 
-/// Intervals within these multiples of the one before are regular.
+/// Intervals within these multiples of the usual one are regular.
 const REGULAR: std::ops::Range<f64> = 0.7..1.4;
-/// So many regular intervals in a row before a jump make it one.
+/// So many regular intervals in a row make a stream steady; after as many others the usual one is learned
+/// anew.
 const STEADY: u32 = 10;
 /// Shorter jumps do little harm, longer ones are gaps, s.
 const JUMPS: std::ops::Range<f64> = 0.02..0.25;
 /// An interval this close to a whole number of usual ones may mean lost messages, as a share of one.
 const WHOLE: f64 = 0.1;
+/// Intervals over which jitter is averaged.
+const JITTER_MEMORY: f64 = 30.0;
+/// Intervals whose mean is the usual one.
+const MEAN_MEMORY: f64 = 100.0;
+/// Less than this does no harm, s.
+const LEAST_JITTER: f64 = 1e-3;
 /// Samples that are kept, s.
 const MEMORY: f64 = 2.0;
 /// Turns are compared over at least this time, s.
@@ -33,25 +40,38 @@ const PATIENCE: f64 = 2.0;
 #[derive(Debug, Clone, Default)]
 struct Stream {
     last: Option<Stamp>,
+    /// The usual one, s.
     interval: f64,
+    /// Intervals that it is the mean of.
+    count: f64,
+    /// Regular and irregular intervals since the last one of the other kind.
     regular: u32,
+    irregular: u32,
+    /// Of the intervals, but for lost messages, s^2.
+    variance: f64,
 }
 
 impl Stream {
     /// By how much longer than usual (s) an interval was in a stream that had been steady.
     fn see(&mut self, stamp: Stamp) -> Option<f64> {
         let interval = stamp.seconds_since(self.last.replace(stamp)?);
-        if REGULAR.contains(&(interval / self.interval)) {
-            self.regular += 1;
-            self.interval += (interval - self.interval) / f64::from(self.regular.min(100));
+        if self.interval == 0.0 || self.irregular >= STEADY {
+            (self.interval, self.count, self.irregular) = (interval, 1.0, 0);
             return None;
         }
-        let steady = std::mem::take(&mut self.regular) >= STEADY;
-        let jump = interval - self.interval;
-        if !steady {
-            self.interval = interval;
+        let off = interval / self.interval;
+        let jitter = (off - off.round()) * self.interval;
+        self.variance += (jitter * jitter - self.variance) / JITTER_MEMORY;
+        if REGULAR.contains(&off) {
+            self.irregular = 0;
+            self.regular += 1;
+            self.count = (self.count + 1.0).min(MEAN_MEMORY);
+            self.interval += (interval - self.interval) / self.count;
+            return None;
         }
-        steady.then_some(jump)
+        self.irregular += 1;
+        let steady = std::mem::take(&mut self.regular) >= STEADY;
+        steady.then_some(interval - self.interval)
     }
 }
 
@@ -151,6 +171,13 @@ impl ClockWatch {
     /// What the jumps so far add to the time of a frame on the IMU's clock, s.
     pub fn offset(&self) -> f64 {
         self.offset
+    }
+
+    /// Standard deviation of the time between two frames as stamps of frames and IMU have it, s; 0 if
+    /// that is what any log has.
+    pub fn jitter(&self) -> f64 {
+        let jitter = (self.imu.variance + self.frames.variance).sqrt();
+        if jitter > LEAST_JITTER { jitter } else { 0.0 }
     }
 
     /// Whether a jump has been seen of which it is not known yet what it was.
@@ -278,6 +305,23 @@ mod tests {
             }
         }
         (offsets, clock.is_in_doubt())
+    }
+
+    #[test]
+    fn jitter_is_told_from_losses() {
+        let jitter = |interval: fn(u32) -> f64| {
+            let mut clock = ClockWatch::default();
+            let mut time = 0.0;
+            for k in 0..200 {
+                time += interval(k);
+                clock.frame(at(time));
+            }
+            clock.jitter()
+        };
+        // Every third frame is missing after a while.
+        assert_eq!(jitter(|k| if k < 20 || k % 2 == 0 { 0.03 } else { 0.06 }), 0.0);
+        let found = jitter(|k| if k % 2 == 0 { 0.032 } else { 0.028 });
+        assert!((found - 0.002).abs() < 2e-4, "{found}");
     }
 
     #[test]

@@ -103,6 +103,9 @@ const PATIENCE: f64 = 1.0;
 /// Fewer matches than this may agree on a pose by chance.
 const FEW_ASTRAY: usize = 30;
 
+/// Frames after which the points of a new map lie where they are, so that others move.
+const SETTLED: u64 = 30;
+
 /// What exists once the filter has started.
 struct Running {
     filter: Box<dyn VisualInertialFilter>,
@@ -446,6 +449,9 @@ impl Odometry {
             &self.config,
             &mut notes,
         );
+        if let Some(points) = running.filter.point_state().filter(|_| self.has_imu) {
+            points.blur_time(self.clock.jitter());
+        }
         let mut view = View {
             config: &self.config,
             camera: &self.camera,
@@ -468,10 +474,10 @@ impl Odometry {
         {
             let world_from_body = pose * body_from_camera.inverse();
             let after = stamp.seconds_since(*before);
-            let in_the_dark = lost && !self.health.is_lost_in_sight();
-            let jump = Jump::between(&sound.state, &world_from_body, after, in_the_dark);
+            let in_sight = self.health.is_lost_in_sight();
+            let jump = Jump::between(&sound.state, &world_from_body, after, lost && !in_sight);
             let seen =
-                (lost || jump.is_some()).then(|| running.in_view(&pose, front, &found, &view));
+                (in_sight || jump.is_some()).then(|| running.in_view(&pose, front, &found, &view));
             if let Some(seen) = seen.filter(|seen| !seen.confirms()) {
                 tracing::debug!("at {stamp} s {seen:?} do not confirm a pose");
                 found.pose = None;
@@ -923,7 +929,9 @@ impl Running {
         let astray: Vec<_> = (correspondences.iter().zip(membership(&near, matches.len())))
             .filter_map(|(correspondence, near)| (!near).then_some(*correspondence))
             .collect();
-        let suspect = astray.len() >= FEW_ASTRAY && 4 * astray.len() > matches.len();
+        let suspect = self.seeing_frames >= SETTLED
+            && astray.len() >= FEW_ASTRAY
+            && 4 * astray.len() > matches.len();
         let others = agree(if suspect { &astray } else { &[] });
         (Some(found), others.map_or(0, |others| others.inliers.len()))
     }

@@ -41,7 +41,7 @@ const FORCE_FACTOR: f64 = 1.6;
 /// With at least so many matches, and this share of those that disagree with the camera's pose,
 /// agreeing on another one in so many frames in a row, something moves.
 const MANY_ASTRAY: usize = 30;
-const SHARE_ASTRAY: f64 = 0.4;
+const SHARE_ASTRAY: f64 = 0.2;
 const FRAMES_ASTRAY: u32 = 2;
 
 /// Speaks once when a condition is first met, and again only after it was absent for a while.

@@ -111,7 +111,7 @@ impl Feature {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Extraction {
     pub features: Vec<Feature>,
-    /// What they were found in.
+    /// What they were found in; empty where it is not kept.
     pub pyramid: Pyramid,
 }
 

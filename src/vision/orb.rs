@@ -76,6 +76,7 @@ pub struct OrbExtractor {
     /// With the lower threshold.
     sensitive: Ptr<FastFeatureDetector>,
     orb: Ptr<ORB>,
+    keeps_pyramid: bool,
 }
 
 impl OrbExtractor {
@@ -116,7 +117,13 @@ impl OrbExtractor {
             fast: detector(config.fast_threshold)?,
             sensitive: detector(config.min_fast_threshold.min(config.fast_threshold))?,
             orb,
+            keeps_pyramid: false,
         })
+    }
+
+    /// The same, that gives the pyramid with the features, to be looked at again.
+    pub fn keeping_pyramid(self, keeps_pyramid: bool) -> Self {
+        Self { keeps_pyramid, ..self }
     }
 
     /// Features of one frame, ordered by octave, row and column. None in the dark is no error.
@@ -135,7 +142,8 @@ impl OrbExtractor {
         let corners = spread(corners, color.0, color.1, cell, spacing, self.config.max_features);
         let described = self.describe(&pyramid, &corners)?;
         let features = self.measure(frame, &pyramid, &described)?;
-        Ok(Extraction { features, pyramid: self.copied(&pyramid)? })
+        let pyramid = if self.keeps_pyramid { self.copied(&pyramid)? } else { Pyramid::default() };
+        Ok(Extraction { features, pyramid })
     }
 
     fn copied(&self, levels: &[Mat]) -> Result<Pyramid, VisionError> {

@@ -22,7 +22,7 @@ peers (each from the previous frame alone, poses chained):
 EXAMPLE = """\
 examples:
   tools/compare_peers --filters mfgr,mekfr --out peers-out ../shared/data/tum_fr1_rpy
-  tools/compare_peers --grid --filters mfgs,mfgr,mfgd,mekfs,mekfr,mekfd LOG...   # as in the README
+  tools/compare_peers --grid --filters mfgs,mfgr,mfgd,mekfs,mekfr,mekfd --seeds 8 LOG...   # as in the README
 """
 # APE RMSE (m) by log of an estimator that this tool does not run: monocular, given the true start.
 GIVEN = {
@@ -45,6 +45,12 @@ def peer_names(text):
     return names(text)
 
 
+def positive(text):
+    if int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
+    return int(text)
+
+
 def parse_arguments():
     parser = argparse.ArgumentParser(
         prog="tools/compare_peers", description=DESCRIPTION, epilog=EXAMPLE,
@@ -58,6 +64,8 @@ def parse_arguments():
                         help="the mfg-vio to run (default: the release build of this tree)")
     parser.add_argument("--out", type=Path, default=Path("peers-out"), metavar="DIR",
                         help="trajectories go to DIR/LOG/ESTIMATOR (default: %(default)s)")
+    parser.add_argument("--seeds", type=positive, default=1, metavar="N",
+                        help="mean of each filter over the seeds 1 to N (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, metavar="N",
                         help="threads of each estimator (default: %(default)s)")
     form = parser.add_mutually_exclusive_group()

@@ -69,10 +69,22 @@ def run_peer(name, log, folder, threads):
     return Row(log.name, name, rmse, matched, len(poses), lost, 1e3 * seconds / len(poses), str(path))
 
 
-def run_ours(binary, name, log, folder, threads):
+def run_ours(binary, name, log, folder, threads, seeds):
+    """Means over the seeds of RANSAC; the trajectory of the first."""
+    rows = [run_seed(binary, name, log, folder, threads, seed) for seed in range(1, seeds + 1)]
+    failed = [row for row in rows if row.error]
+    if failed:
+        return failed[0]
+    means = {key: float(np.mean([getattr(row, key) for row in rows]))
+             for key in ("ape_rmse_m", "ms_per_frame")}
+    return dataclasses.replace(rows[0], **means)
+
+
+def run_seed(binary, name, log, folder, threads, seed):
     estimator = f"mfg-vio {name}"
-    out = folder / f"mfg-vio-{name}"
-    command = [binary, "replay", log.path, "--filter", name, "--out", out, "--threads", str(threads)]
+    out = folder / (f"mfg-vio-{name}" if seed == 1 else f"mfg-vio-{name}-{seed}")
+    command = [binary, "replay", log.path, "--filter", name, "--seed", str(seed), "--out", out,
+               "--threads", str(threads)]
     start = time.perf_counter()
     done = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                           stderr=subprocess.PIPE, text=True, check=False)
@@ -110,7 +122,8 @@ def compare(arguments):
         runs = [(name, lambda name=name: run_peer(name, log, folder, arguments.threads))
                 for name in arguments.peers]
         runs += [(f"mfg-vio {name}",
-                  lambda name=name: run_ours(binary, name, log, folder, arguments.threads))
+                  lambda name=name: run_ours(binary, name, log, folder, arguments.threads,
+                                             arguments.seeds))
                  for name in arguments.filters]
         for estimator, run in runs:
             print(f"compare_peers: {log.name}: {estimator}", file=sys.stderr, flush=True)

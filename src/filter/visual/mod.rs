@@ -49,11 +49,12 @@ pub enum MapTreatment {
 }
 
 /// The filters of `replay --filter`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FilterKind {
     Mfgd,
     Mfgr,
+    #[default]
     Mfgs,
     Mekfd,
     Mekfr,
@@ -63,12 +64,6 @@ pub enum FilterKind {
 impl FilterKind {
     pub const ALL: [Self; 6] =
         [Self::Mfgr, Self::Mfgd, Self::Mfgs, Self::Mekfr, Self::Mekfd, Self::Mekfs];
-
-    /// The filter of logs with and without an IMU: correlated map points halve the error of
-    /// difficult motion, but without an IMU the prediction is too coarse for them.
-    pub fn recommended(has_imu: bool) -> Self {
-        if has_imu { Self::Mfgs } else { Self::Mfgr }
-    }
 
     pub fn name(self) -> &'static str {
         match self {
@@ -438,6 +433,10 @@ pub trait PointState {
 
     /// Marginalizes a point out: what the belief learned by it stays. False if it is not held.
     fn release(&mut self, id: u64) -> bool;
+
+    /// Takes the time of the belief to be uncertain by this standard deviation (s), while the body moves
+    /// on.
+    fn blur_time(&mut self, sd: f64);
 
     /// Moves the body by `way`, in body coordinates, which is known as well as `spread` says, and leaves
     /// it at rest there. Points, biases and calibration stay. The vertical must be known.

@@ -1,7 +1,8 @@
 //! Filters that keep map points in the state, with all correlations (`mfgs`, `mekfs`).
 
 use nalgebra::{
-    DMatrix, DVector, Dyn, Isometry3, Matrix3, OMatrix, Point3, U3, UnitQuaternion, Vector3,
+    DMatrix, DVector, Dyn, Isometry3, Matrix3, OMatrix, Point3, SVector, U3, UnitQuaternion,
+    Vector3,
 };
 
 use super::calibration::{BodyMotion, Calibration};
@@ -768,6 +769,13 @@ impl PointState for SlamFilter {
         true
     }
 
+    fn blur_time(&mut self, sd: f64) {
+        let mut moves = SVector::<f64, NAVIGATION>::zeros();
+        moves.fixed_rows_mut::<3>(block::ROTATION).copy_from(&self.motion().angular_velocity);
+        moves.fixed_rows_mut::<3>(block::POSITION).copy_from(&self.belief.state.velocity);
+        self.belief.covariance += moves * moves.transpose() * sd.powi(2);
+    }
+
     fn carry_off(&mut self, way: &Isometry3<f64>, spread: &MotionSpread) {
         let rotation = self.belief.state.world_from_body.rotation.to_rotation_matrix();
         let mut step = NavCovariance::identity();
@@ -800,7 +808,7 @@ mod tests {
     use crate::filter::FilterKind;
     use crate::inertial::{ImuConfig, NavState, Stamp, attitude_from_gravity};
     use approx::assert_relative_eq;
-    use nalgebra::{SVector, Translation3};
+    use nalgebra::Translation3;
     use proptest::prelude::*;
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
@@ -908,6 +916,37 @@ mod tests {
             let turned = turned.angle_to(&prior.state.world_from_body.rotation);
             prop_assert!(turned < 1e-7, "{turned}");
         }
+    }
+
+    /// A turn about the vertical at an uncertain time: by finite differences.
+    #[test]
+    fn a_blurred_time_moves_the_body_along() {
+        let mut rng = ChaCha8Rng::seed_from_u64(9);
+        let prior = belief(&mut rng, 0.02);
+        let mut mfgs = filter(FilterKind::Mfgs, prior);
+        let sample = |nanos| ImuSample {
+            stamp: Stamp::from_nanos(nanos),
+            angular_velocity: Vector3::new(0.4, -0.2, 0.7),
+            specific_force: Vector3::zeros(),
+        };
+        assert!(mfgs.propagate(&sample(0), &sample(1000)));
+        let before = *mfgs.belief();
+        mfgs.point_state().unwrap().blur_time(0.002);
+        let added = mfgs.belief().covariance - before.covariance;
+        assert!(mfgs.propagate(&sample(0), &sample(1_000_000)));
+        let (from, to) = (before.state.world_from_body, mfgs.belief().state.world_from_body);
+        let turn = from.rotation.rotation_to(&to.rotation);
+        let turn = (from.rotation.inverse() * turn * from.rotation).scaled_axis() * 2.0;
+        let shift = (to.translation.vector - from.translation.vector) * 2.0;
+        let expected = turn * turn.transpose();
+        assert_relative_eq!(
+            added.fixed_view::<3, 3>(0, 0).into_owned(),
+            expected,
+            max_relative = 0.01
+        );
+        let expected = turn * shift.transpose();
+        let cross = added.fixed_view::<3, 3>(block::ROTATION, block::POSITION).into_owned();
+        assert_relative_eq!(cross, expected, epsilon = 0.02 * expected.norm());
     }
 
     /// By its map a body that was carried off is found again, as unsure of the world as the map is.
