@@ -1,3 +1,5 @@
+//! Gaps in the IMU's data, filled in or not.
+
 use super::ImuSample;
 
 /// Whether the IMU was there between two samples.

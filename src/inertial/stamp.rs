@@ -1,3 +1,5 @@
+//! Time on the sensors' clock.
+
 use std::fmt;
 
 /// A point in time on the sensor's header clock, in nanoseconds.

@@ -19,14 +19,14 @@ const LEAST_INFORMATION: f64 = 1e-9;
 /// A matrix Fisher belief whose propagation and likelihood are those of the linearised invariant
 /// error, and whose posterior is Bayes' rule on SO(3).
 ///
-/// The covariance is carried between measurements and the parameter formed only for Bayes' rule,
-/// by (31); polar decompositions, no singular values. It is the same for both filters, as
-/// `P_R = R P_L R^T`: all that tells them apart is when the noise enters, (37) before the turn and
-/// (49) after it, and only anisotropic noise knows the difference. It is resolved in the frame in
-/// which the turns that the gyroscope measures leave it alone, the world for a gyroscope of the
-/// body's rate. Vectors of any length with any covariance are admissible; weights in Wahba's problem are the inverse mean variances. Where that problem
-/// has no unique solution (a single direction) the likelihood is that of the direction, as in
-/// W22 (4.14).
+/// The covariance is carried between measurements and the parameter formed only for Bayes' rule, by
+/// (31); polar decompositions, no singular values. It is the same for both filters, as `P_R = R P_L
+/// R^T`: all that tells them apart is when the noise enters, (37) before the turn and (49) after
+/// it, and only anisotropic noise knows the difference. It is resolved in the frame in which the
+/// turns that the gyroscope measures leave it alone, the world for a gyroscope of the body's rate.
+/// Vectors of any length with any covariance are admissible; weights in Wahba's problem are the
+/// inverse mean variances. Where that problem has no unique solution (a single direction) the
+/// likelihood is that of the direction, as in W22 (4.14).
 #[derive(Debug, Clone, Copy)]
 pub struct FastNonlinear {
     /// Frame of the invariant error that is linearised: the world's for FNF-R, the body's for
