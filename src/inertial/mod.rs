@@ -5,6 +5,7 @@ mod coverage;
 mod directions;
 mod imu;
 mod initial;
+mod noise;
 mod propagation;
 mod stamp;
 mod state;
@@ -16,6 +17,7 @@ pub use directions::{
 };
 pub use imu::{ImuConfig, ImuSample, PositionFix};
 pub use initial::{InitialAttitude, StandstillCheck, StandstillConfig, attitude_from_gravity};
+pub(crate) use noise::DrivingNoise;
 pub(crate) use propagation::symmetrize;
 pub use propagation::{MotionModel, Propagator};
 pub use stamp::Stamp;

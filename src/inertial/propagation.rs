@@ -1,7 +1,7 @@
 use nalgebra::{Isometry3, Matrix3, Matrix6, SMatrix, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{Belief, ImuConfig, ImuSample, NavCovariance, NavState, block};
+use super::{Belief, DrivingNoise, ImuConfig, ImuSample, NavCovariance, NavState, block};
 use crate::so3;
 
 /// What carries the belief between two camera frames.
@@ -25,14 +25,7 @@ pub enum MotionModel {
 pub struct Propagator {
     model: MotionModel,
     gravity: Vector3<f64>,
-    gyro_noise: f64,
-    accel_noise: f64,
-    gyro_bias_walk: f64,
-    accel_bias_walk: f64,
-    /// Noises while the IMU is silent.
-    gap_gyro_noise: f64,
-    gap_accel_noise: f64,
-    in_gap: bool,
+    noise: DrivingNoise,
     /// Standard deviations of the biases of a start; 0 without an IMU.
     gyro_bias_sd: f64,
     accel_bias_sd: f64,
@@ -43,13 +36,7 @@ impl Propagator {
         Self {
             model: MotionModel::Inertial,
             gravity: Vector3::new(0.0, 0.0, -config.gravity),
-            gyro_noise: config.gyro_noise,
-            accel_noise: config.accel_noise,
-            gyro_bias_walk: config.gyro_bias_walk,
-            accel_bias_walk: config.accel_bias_walk,
-            gap_gyro_noise: config.gap_gyro_noise,
-            gap_accel_noise: config.gap_accel_noise,
-            in_gap: false,
+            noise: DrivingNoise::inertial(config),
             gyro_bias_sd: config.gyro_bias_sd,
             accel_bias_sd: config.accel_bias_sd,
         }
@@ -61,13 +48,7 @@ impl Propagator {
         Self {
             model: MotionModel::ConstantVelocity,
             gravity: Vector3::zeros(),
-            gyro_noise: 0.0,
-            accel_noise: acceleration,
-            gyro_bias_walk: angular_acceleration,
-            accel_bias_walk: 0.0,
-            gap_gyro_noise: 0.0,
-            gap_accel_noise: acceleration,
-            in_gap: false,
+            noise: DrivingNoise::constant_velocity(angular_acceleration, acceleration),
             gyro_bias_sd: 0.0,
             accel_bias_sd: 0.0,
         }
@@ -80,7 +61,7 @@ impl Propagator {
 
     /// Says whether the next samples only stand in for those of a gap in the IMU's data.
     pub fn set_imu_gap(&mut self, in_gap: bool) {
-        self.in_gap = in_gap;
+        self.noise.set_imu_gap(in_gap);
     }
 
     pub fn model(&self) -> MotionModel {
@@ -187,7 +168,9 @@ impl Propagator {
         if self.model != MotionModel::Inertial {
             return None;
         }
-        let mut covariance = Self { in_gap: true, ..self.clone() }.noise(h);
+        let mut in_gap = self.noise;
+        in_gap.set_imu_gap(true);
+        let mut covariance = added_covariance(&in_gap, h);
         for (start, sd) in
             [(block::GYRO_BIAS, self.gyro_bias_sd), (block::ACCEL_BIAS, self.accel_bias_sd)]
         {
@@ -211,7 +194,8 @@ impl Propagator {
         let acceleration = middle * force + self.gravity;
 
         let transition = transition(&middle, &turn, &force, h);
-        belief.covariance = transition * belief.covariance * transition.transpose() + self.noise(h);
+        belief.covariance = transition * belief.covariance * transition.transpose()
+            + added_covariance(&self.noise, h);
         symmetrize(&mut belief.covariance);
 
         let position = state.world_from_body.translation.vector
@@ -225,34 +209,30 @@ impl Propagator {
         );
         transition
     }
+}
 
-    /// Covariance of the error that the white noises add over the step.
-    fn noise(&self, h: f64) -> NavCovariance {
-        let mut q = NavCovariance::zeros();
-        let (gyro, accel) = if self.in_gap {
-            (self.gap_gyro_noise, self.gap_accel_noise)
-        } else {
-            (self.gyro_noise, self.accel_noise)
+/// Covariance of the error that the white noises add over a step of `h` seconds.
+fn added_covariance(noise: &DrivingNoise, h: f64) -> NavCovariance {
+    let mut q = NavCovariance::zeros();
+    let white = noise.white();
+    let (gyro, accel) = (white.gyro.powi(2), white.accel.powi(2));
+    let walk = noise.gyro_bias_walk.powi(2);
+    for k in 0..3 {
+        let mut add = |row: usize, column: usize, value: f64| {
+            q[(row + k, column + k)] += value;
+            if row != column {
+                q[(column + k, row + k)] += value;
+            }
         };
-        let accel = accel.powi(2);
-        let walk = self.gyro_bias_walk.powi(2);
-        for k in 0..3 {
-            let mut add = |row: usize, column: usize, value: f64| {
-                q[(row + k, column + k)] += value;
-                if row != column {
-                    q[(column + k, row + k)] += value;
-                }
-            };
-            add(block::ROTATION, block::ROTATION, gyro.powi(2) * h + walk * h.powi(3) / 3.0);
-            add(block::ROTATION, block::GYRO_BIAS, -walk * h * h / 2.0);
-            add(block::GYRO_BIAS, block::GYRO_BIAS, walk * h);
-            add(block::VELOCITY, block::VELOCITY, accel * h);
-            add(block::VELOCITY, block::POSITION, accel * h * h / 2.0);
-            add(block::POSITION, block::POSITION, accel * h.powi(3) / 3.0);
-            add(block::ACCEL_BIAS, block::ACCEL_BIAS, self.accel_bias_walk.powi(2) * h);
-        }
-        q
+        add(block::ROTATION, block::ROTATION, gyro * h + walk * h.powi(3) / 3.0);
+        add(block::ROTATION, block::GYRO_BIAS, -walk * h * h / 2.0);
+        add(block::GYRO_BIAS, block::GYRO_BIAS, walk * h);
+        add(block::VELOCITY, block::VELOCITY, accel * h);
+        add(block::VELOCITY, block::POSITION, accel * h * h / 2.0);
+        add(block::POSITION, block::POSITION, accel * h.powi(3) / 3.0);
+        add(block::ACCEL_BIAS, block::ACCEL_BIAS, noise.accel_bias_walk.powi(2) * h);
     }
+    q
 }
 
 /// Derivative of the error of [`NavCovariance`] after a step by the error before it, `middle`

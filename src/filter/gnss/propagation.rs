@@ -19,20 +19,14 @@ use super::central::{CentralMoments, Matrix9, Vector9};
 use crate::alignment::vectorize;
 use crate::distribution::matrix_fisher::{MatrixFisher, MatrixFisherError, s_from_complement_near};
 use crate::filter::FilterError;
-use crate::inertial::ImuConfig;
+use crate::inertial::{DrivingNoise, ImuConfig};
 use crate::so3::{ProperSvd, exp, hat, left_jacobian, proper_svd};
 
 /// Gravity and the noise densities of an IMU.
 #[derive(Debug, Clone)]
 pub(super) struct MomentPropagator {
     gravity: Vector3<f64>,
-    gyro_noise: f64,
-    accel_noise: f64,
-    gyro_bias_walk: f64,
-    accel_bias_walk: f64,
-    gap_gyro_noise: f64,
-    gap_accel_noise: f64,
-    in_gap: bool,
+    noise: DrivingNoise,
 }
 
 /// Moments after a step, in the principal axes before it.
@@ -44,29 +38,11 @@ struct Moved {
 
 impl MomentPropagator {
     pub fn new(imu: &ImuConfig) -> Self {
-        Self {
-            gravity: Vector3::new(0.0, 0.0, -imu.gravity),
-            gyro_noise: imu.gyro_noise,
-            accel_noise: imu.accel_noise,
-            gyro_bias_walk: imu.gyro_bias_walk,
-            accel_bias_walk: imu.accel_bias_walk,
-            gap_gyro_noise: imu.gap_gyro_noise,
-            gap_accel_noise: imu.gap_accel_noise,
-            in_gap: false,
-        }
+        Self { gravity: Vector3::new(0.0, 0.0, -imu.gravity), noise: DrivingNoise::inertial(imu) }
     }
 
     pub fn set_imu_gap(&mut self, in_gap: bool) {
-        self.in_gap = in_gap;
-    }
-
-    /// White noise of gyroscope and accelerometer.
-    fn white(&self) -> (f64, f64) {
-        if self.in_gap {
-            (self.gap_gyro_noise, self.gap_accel_noise)
-        } else {
-            (self.gyro_noise, self.accel_noise)
-        }
+        self.noise.set_imu_gap(in_gap);
     }
 
     /// The belief `h` seconds later, `rate` and `force` being the measured angular velocity and
@@ -129,8 +105,7 @@ impl MomentPropagator {
         let bias_covariance = conditional.fixed_view::<3, 3>(GYRO_BIAS, GYRO_BIAS).into_owned();
 
         // q' = affine + bilinear + noise.
-        let (gyro_noise, _) = self.white();
-        let noise = gyro_noise.powi(2) * h;
+        let noise = self.noise.white().gyro.powi(2) * h;
         let shrink = mean_of_noise(noise);
         let turned_mean = SMatrix::<f64, 9, 3>::from_columns(&[
             turned(0, &central.mean),
@@ -192,7 +167,7 @@ impl MomentPropagator {
         let product = bilinear_x * slope.transpose();
         let x = slope * covariance * slope.transpose()
             + transition * conditional * transition.transpose()
-            + self.noise(h)
+            + self.added_covariance(h)
             + product
             + product.transpose();
         let q = affine * covariance * affine.transpose()
@@ -204,9 +179,8 @@ impl MomentPropagator {
     }
 
     /// Covariance that white noises add to the Euclidean state over a step.
-    fn noise(&self, h: f64) -> EuclideanCovariance {
-        let (_, accel_noise) = self.white();
-        let accel = accel_noise.powi(2);
+    fn added_covariance(&self, h: f64) -> EuclideanCovariance {
+        let accel = self.noise.white().accel.powi(2);
         let mut q = EuclideanCovariance::zeros();
         for k in 0..3 {
             let (v, p) = (VELOCITY + k, POSITION + k);
@@ -214,8 +188,8 @@ impl MomentPropagator {
             q[(p, p)] = accel * h.powi(3) / 3.0;
             q[(v, p)] = accel * h * h / 2.0;
             q[(p, v)] = q[(v, p)];
-            q[(GYRO_BIAS + k, GYRO_BIAS + k)] = self.gyro_bias_walk.powi(2) * h;
-            q[(ACCEL_BIAS + k, ACCEL_BIAS + k)] = self.accel_bias_walk.powi(2) * h;
+            q[(GYRO_BIAS + k, GYRO_BIAS + k)] = self.noise.gyro_bias_walk.powi(2) * h;
+            q[(ACCEL_BIAS + k, ACCEL_BIAS + k)] = self.noise.accel_bias_walk.powi(2) * h;
         }
         q
     }
