@@ -261,6 +261,28 @@ fn faults_are_named_and_survived() {
     assert!(fail(&["faults", log, "--fault", "black:20:1"]).contains("before `black:20:1` begins"));
 }
 
+/// What a carried body, a clock, a unit or a bias does to the estimate is undone, or known to it: squared
+/// errors below the 99 % quantile of chi-square (the errors of one run are alike).
+#[test]
+fn what_the_sensors_did_does_not_stay() {
+    let directory = tempfile::tempdir().unwrap();
+    let log = directory.path().join("room.mcap");
+    succeed(&["simulate", "--duration", "7", "--out", text(&log)]);
+    let mut arguments = vec!["faults", text(&log), "--json"];
+    let faults = ["kidnapped:4:0.5", "imu-stamps:3:1", "gyro-unit:0:inf", "bias:0:inf"];
+    faults.iter().for_each(|fault| arguments.extend(["--fault", fault]));
+    let report = json(&arguments);
+    let outcomes = report["outcomes"].as_array().unwrap();
+    assert_eq!(outcomes.len(), 1 + faults.len());
+    for outcome in outcomes {
+        let recovered = &outcome["recovered"];
+        assert!(recovered["position"].as_f64().unwrap() < 0.015, "{outcome}");
+        for nees in ["attitude_nees", "position_nees"] {
+            assert!(recovered[nees].as_f64().unwrap() < 11.3, "{outcome}");
+        }
+    }
+}
+
 /// The log begins with a second and a half of rest.
 #[test]
 fn rest_is_found_and_told() {

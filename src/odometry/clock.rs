@@ -243,8 +243,9 @@ impl ClockWatch {
         self.frames = Stream::default();
         let text = format!(
             "a clock has jumped before {time} s: the turns seen fit the gyroscope if frames are timed \
-             {:.1} ms later",
-            1e3 * offset
+             {:.1} ms {}",
+            1e3 * offset.abs(),
+            if offset > 0.0 { "later" } else { "earlier" }
         );
         Some((offset, Note { level: NoteLevel::Warning, text }))
     }
