@@ -379,6 +379,11 @@ fn see(
     });
     let (landmarks, pairs): (Vec<usize>, Vec<PointPair>) = matched.unzip();
     let updated = filter.update(&pairs).is_some();
+    if updated && treatment == MapTreatment::Correlated {
+        // A filter that is to hold its points holds none yet, while its attitude is broad. What was
+        // known of these is in its pose now, and would count twice.
+        landmarks.iter().for_each(|&landmark| map[landmark] = None);
+    }
     if updated && treatment == MapTreatment::Uncertain {
         let refinement = filter.map_refinement();
         let entered = landmarks.into_iter().zip(&pairs).zip(filter.passed());
@@ -390,7 +395,6 @@ fn see(
     }
     for sighting in &frame.sightings {
         let point = &mut map[sighting.landmark];
-        // A filter that is to hold its points holds none yet, while its attitude is broad.
         if point.is_none() && treatment != MapTreatment::Correlated {
             *point = Some(filter.insert(treatment, &sighting.in_body, &body_covariance));
         }
