@@ -439,8 +439,7 @@ impl Odometry {
         let mut notes = std::mem::take(&mut self.notes);
         let size = (front.frame.color.width(), front.frame.color.height());
         let lost = self.health.is_lost();
-        let mut times = StageTimes { features: front.seconds, ..StageTimes::default() };
-        let mut clock = StageClock::start();
+        let mut laps = StageClock::start(front.seconds);
         self.stats.imu_gaps += running.propagate_to(
             stamp,
             &mut self.imu,
@@ -461,41 +460,23 @@ impl Odometry {
             seed: self.seed.wrapping_add(number),
             lost,
         };
-        times.propagation = clock.lap();
+        laps.lap(|times| &mut times.propagation);
 
         let features = &front.extraction.features;
         let detected = features.len();
         let with_depth = features.iter().filter(|feature| feature.depth.is_some()).count();
         notes.extend(self.watch.frame(front.frame.stamp, features, view.size));
-        let mut found = running.look(features, &view, &mut clock, &mut times);
-        if let (Some(pose), Some((before, sound))) = (found.pose, &self.sound)
-            && running.filter.knows_vertical()
-            && running.filter.point_state().is_some()
-        {
-            let world_from_body = pose * body_from_camera.inverse();
-            let after = stamp.seconds_since(*before);
-            let in_sight = self.health.is_lost_in_sight();
-            let jump = Jump::between(&sound.state, &world_from_body, after, lost && !in_sight);
-            let seen =
-                (in_sight || jump.is_some()).then(|| running.in_view(&pose, front, &found, &view));
-            if let Some(seen) = seen.filter(|seen| !seen.confirms()) {
-                tracing::debug!("at {stamp} s {seen:?} do not confirm a pose");
-                found.pose = None;
-                found.inliers.clear();
-            } else if let Some((jump, seen)) = jump.zip(seen) {
-                running.carry_off(&world_from_body, &self.config.filter);
-                notes.push(jump.note(stamp, seen));
-                view.shutter = running.shutter(&self.config, size, &body_from_camera, None);
-                found = running.look(features, &view, &mut clock, &mut times);
-            }
-        }
+        let in_sight = self.health.is_lost_in_sight();
+        let sound = self.sound.as_ref();
+        let mut found = running.locate(front, &mut view, sound, stamp, in_sight, &mut laps);
+        notes.extend(found.note.take());
         let attitude = found.pose.map(|pose| pose.rotation * body_from_camera.rotation.inverse());
         if let Some(attitude) = attitude.filter(|_| self.has_imu) {
             notes.extend(self.gyroscope.attitude(stamp, attitude));
         }
         let bias = running.filter.belief().state.gyro_bias;
         let retimed = self.clock.attitude(stamp, attitude, &bias);
-        let Found { candidates, mut matches, pose, mut inliers, others } = found;
+        let Found { candidates, mut matches, pose, mut inliers, others, .. } = found;
 
         if let Some(pose) = pose.filter(|_| view.shutter.is_rolling()) {
             let known = Some(&pose);
@@ -545,7 +526,7 @@ impl Odometry {
         if self.health.is_sound(innovation) {
             self.sound = Some((stamp, *belief));
         }
-        times.update = clock.lap();
+        laps.lap(|times| &mut times.update);
 
         if !self.health.is_lost() {
             running.seeing_frames += 1;
@@ -559,7 +540,7 @@ impl Odometry {
         let shutter = running.shutter(view.config, view.size, &body_from_camera, None);
         let view = View { body_from_camera: &body_from_camera, shutter, ..view };
         let fates = running.grow_map(features, &matches, &inliers, treatment, lost, &view);
-        times.map = clock.lap();
+        laps.lap(|times| &mut times.map);
 
         if let Some((offset, note)) = retimed {
             notes.push(note);
@@ -591,7 +572,7 @@ impl Odometry {
                 new_points: count(KeypointRole::New),
                 map_points: running.map.len(),
             },
-            times,
+            times: laps.times,
             keypoints: keypoint_views(features, &fates),
             map: wants_map.then(|| map_views(&running.map, running.seeing_frames)),
             notes,
@@ -610,6 +591,8 @@ struct Found {
     inliers: Vec<usize>,
     /// Matches that agree on another pose.
     others: usize,
+    /// That the body was carried off.
+    note: Option<Note>,
 }
 
 /// What became of a feature.
@@ -767,16 +750,49 @@ impl Running {
         reported.attitude().map(|attitude| *attitude.svd())
     }
 
-    /// Looks for the map in a frame; where nothing of it agrees near the prediction, everywhere.
-    fn look(
-        &self,
-        features: &[Feature],
-        view: &View,
-        clock: &mut StageClock,
-        times: &mut StageTimes,
+    /// Looks for the map in a frame. A pose further from `sound`, the last one that nothing spoke
+    /// against, than a body moves, or found when vision was lost `in_sight`, must show what should be
+    /// in view there. Then the body is put there, and all is looked for again.
+    fn locate(
+        &mut self,
+        front: &FrontEndFrame,
+        view: &mut View,
+        sound: Option<&(Stamp, Belief)>,
+        stamp: Stamp,
+        in_sight: bool,
+        laps: &mut StageClock,
     ) -> Found {
+        let features = &front.extraction.features;
+        let mut found = self.look(features, view, laps);
+        let Some((pose, (before, sound))) = found.pose.zip(sound) else { return found };
+        if !self.filter.knows_vertical() || self.filter.point_state().is_none() {
+            return found;
+        }
+        let world_from_body = pose * view.body_from_camera.inverse();
+        let after = stamp.seconds_since(*before);
+        let in_the_dark = view.lost && !in_sight;
+        let jump = Jump::between(&sound.state, &world_from_body, after, in_the_dark);
+        if !in_sight && jump.is_none() {
+            return found;
+        }
+        let seen = self.in_view(&pose, front, &found, view);
+        if !seen.confirms() {
+            tracing::debug!("at {stamp} s {seen:?} do not confirm a pose");
+            return Found { pose: None, inliers: Vec::new(), ..found };
+        }
+        if let Some(jump) = jump {
+            self.carry_off(&world_from_body, &view.config.filter);
+            view.shutter = self.shutter(view.config, view.size, view.body_from_camera, None);
+            found = self.look(features, view, laps);
+            found.note = Some(jump.note(stamp, seen));
+        }
+        found
+    }
+
+    /// Looks for the map in a frame; where nothing of it agrees near the prediction, everywhere.
+    fn look(&self, features: &[Feature], view: &View, laps: &mut StageClock) -> Found {
         let (mut candidates, mut matches) = self.find_matches(features, view);
-        times.matching += clock.lap();
+        laps.lap(|times| &mut times.matching);
         let (mut agreement, mut others) = self.find_pose(&matches, view);
         if agreement.is_none() && candidates < self.map.len() {
             let anywhere = self.match_everywhere(features, view);
@@ -786,13 +802,14 @@ impl Running {
                 (agreement, others) = (agreeing, moving);
             }
         }
-        times.ransac += clock.lap();
+        laps.lap(|times| &mut times.ransac);
         Found {
             candidates,
             matches,
             pose: agreement.as_ref().map(|agreement| agreement.model),
             inliers: agreement.map(|agreement| agreement.inliers).unwrap_or_default(),
             others,
+            note: None,
         }
     }
 
@@ -1175,20 +1192,24 @@ fn camera_looking_ahead() -> UnitQuaternion<f64> {
     UnitQuaternion::from_matrix(&world_from_camera)
 }
 
-/// Laps of wall time between the stages of a frame.
-struct StageClock(Instant);
+/// Wall time of the stages of a frame.
+struct StageClock {
+    last: Instant,
+    times: StageTimes,
+}
 
 impl StageClock {
-    fn start() -> Self {
-        Self(Instant::now())
+    /// After a front end that has taken `features` seconds.
+    fn start(features: f64) -> Self {
+        let times = StageTimes { features, ..StageTimes::default() };
+        Self { last: Instant::now(), times }
     }
 
-    /// Seconds since the last lap.
-    fn lap(&mut self) -> f64 {
+    /// Counts the time since the last lap for a stage.
+    fn lap(&mut self, stage: impl Fn(&mut StageTimes) -> &mut f64) {
         let now = Instant::now();
-        let seconds = (now - self.0).as_secs_f64();
-        self.0 = now;
-        seconds
+        *stage(&mut self.times) += (now - self.last).as_secs_f64();
+        self.last = now;
     }
 }
 
