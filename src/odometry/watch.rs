@@ -306,9 +306,11 @@ impl SensorWatch {
                  pose and {others} on another"
             )
         });
+        let predicted_by = if self.force.is_some() { "IMU" } else { "constant velocity" };
         let contradiction = self.contradiction.tell(stamp, contradicted, || {
             format!(
-                "IMU and images contradict each other at {stamp} s: the prediction is distrusted"
+                "{predicted_by} and images contradict each other at {stamp} s: the prediction is \
+                 distrusted"
             )
         });
         moving.into_iter().chain(contradiction)
@@ -449,5 +451,8 @@ mod tests {
 
         let mut without_imu = SensorWatch::new(&ImuConfig::default());
         assert_eq!(without_imu.gyro_bias(at(0.0), &state), None);
+        let seen = Agreement { matches: 100, inliers: 90, others: 0, contradicted: true };
+        let told: Vec<_> = without_imu.agreement(at(0.0), seen).map(|note| note.text).collect();
+        assert!(told[0].starts_with("constant velocity and images"), "{told:?}");
     }
 }
