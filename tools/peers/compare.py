@@ -22,7 +22,7 @@ peers (each from the previous frame alone, poses chained):
 EXAMPLE = """\
 examples:
   tools/compare_peers --filters mfgr,mekfr --out peers-out ../shared/data/tum_fr1_rpy
-  tools/compare_peers --grid --filters mfgs,mfgr,mfgd,mekfs,mekfr,mekfd --seeds 8 LOG...   # as in the README
+  tools/compare_peers --grid --filters mfgs,mfgr,mfgd,mekfs,mekfr,mekfd --seeds 3 LOG...   # as in the README
 """
 # APE RMSE (m) by log of an estimator that this tool does not run: monocular, given the true start.
 GIVEN = {
