@@ -316,20 +316,24 @@ impl SensorWatch {
         moving.into_iter().chain(contradiction)
     }
 
-    // Without an IMU the biases carry the motion of the constant-velocity model.
-
     pub fn gyro_bias(&mut self, stamp: Stamp, state: &NavState) -> Option<Note> {
         let (bias, sd) = (state.gyro_bias.amax(), self.imu.gyro_bias_sd);
-        self.gyro_bias.tell(stamp, self.force.is_some() && is_unusual(bias, sd), || {
+        self.gyro_bias.tell(stamp, self.is_unusual(bias, sd), || {
             unusual_bias(stamp, &format!("gyroscope {bias:.3} rad/s"))
         })
     }
 
     pub fn accel_bias(&mut self, stamp: Stamp, state: &NavState) -> Option<Note> {
         let (bias, sd) = (state.accel_bias.amax(), self.imu.accel_bias_sd);
-        self.accel_bias.tell(stamp, self.force.is_some() && is_unusual(bias, sd), || {
+        self.accel_bias.tell(stamp, self.is_unusual(bias, sd), || {
             unusual_bias(stamp, &format!("accelerometer {bias:.2} m/s^2"))
         })
+    }
+
+    /// Of the largest component of a bias. Without an IMU the biases carry the motion of the
+    /// constant-velocity model.
+    fn is_unusual(&self, bias: f64, sd: f64) -> bool {
+        self.force.is_some() && sd > 0.0 && bias > UNUSUAL_BIAS * sd
     }
 
     /// Whether the accelerometer's bias has been unusual for long enough for all else to have
@@ -338,11 +342,6 @@ impl SensorWatch {
         let Alarm { since, last } = self.accel_bias;
         last == Some(stamp) && since.is_some_and(|since| stamp.seconds_since(since) > LASTING)
     }
-}
-
-/// Of the largest component of a bias.
-fn is_unusual(bias: f64, sd: f64) -> bool {
-    sd > 0.0 && bias > UNUSUAL_BIAS * sd
 }
 
 fn unusual_bias(stamp: Stamp, whose: &str) -> String {
