@@ -6,7 +6,8 @@ use std::hint::black_box;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use mfg_vio::alignment::{PointPair, WeightedPair, align, weighted_kabsch};
 use mfg_vio::filter::{FilterConfig, FilterKind};
-use mfg_vio::inertial::{Belief, ImuConfig, ImuSample, NavCovariance, NavState, Propagator, Stamp};
+use mfg_vio::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator};
+use mfg_vio::sensor::{ImuSample, Stamp};
 use mfg_vio::so3::exp;
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 

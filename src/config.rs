@@ -11,10 +11,10 @@ use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
 use crate::odometry::{HealthConfig, InitConfig, OdometryConfig, SearchConfig, TruthConfig};
+use crate::sensor::CameraConfig;
 use crate::viewer::RecordingConfig;
 use crate::vision::{
-    CameraConfig, DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig,
-    rectified_camera,
+    DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig, rectified_camera,
 };
 
 /// Everything a replay can be told, by section.

@@ -16,6 +16,7 @@ pub mod inertial;
 pub mod map;
 pub mod odometry;
 pub mod replay;
+pub mod sensor;
 pub mod simulation;
 pub mod so3;
 pub mod viewer;

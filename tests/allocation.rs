@@ -15,7 +15,8 @@ use mfg_vio::distribution::matrix_fisher_gaussian::{Correlation, MatrixFisherGau
 use mfg_vio::filter::attitude::{AttitudeFilterKind, AttitudePrior, GyroModel};
 use mfg_vio::filter::gnss::{AttitudeUpdate, GnssFilterKind};
 use mfg_vio::filter::{FilterConfig, FilterKind};
-use mfg_vio::inertial::{Belief, ImuConfig, ImuSample, NavCovariance, NavState, Propagator, Stamp};
+use mfg_vio::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator};
+use mfg_vio::sensor::{ImuSample, Stamp};
 use mfg_vio::so3::{exp, log, proper_svd};
 use nalgebra::{Const, Isometry3, Matrix3, OMatrix, OVector, Rotation3, U3, Vector3};
 use navigation::{initial, step};

@@ -9,9 +9,8 @@ use std::sync::OnceLock;
 
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{LogConfig, open};
-use mfg_vio::inertial::{ImuConfig, Stamp};
-use mfg_vio::odometry::Event;
-use mfg_vio::vision::{CameraConfig, RgbdFrame};
+use mfg_vio::inertial::ImuConfig;
+use mfg_vio::sensor::{CameraConfig, Event, RgbdFrame, Stamp};
 use nalgebra::Isometry3;
 use support::{json, mfg_vio, recording, simulated_log, succeed, text};
 

@@ -5,11 +5,12 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use mfg_vio::inertial::Stamp;
+use mfg_vio::sensor::{
+    CameraConfig, ColorImage, DepthImage, PinholeCamera, PixelFormat, RgbdFrame, Stamp,
+};
 use mfg_vio::vision::{
-    CameraConfig, ColorImage, Correspondence, DepthConfig, DepthImage, Descriptor, Feature,
-    FeatureConfig, Match, MatchingConfig, OrbExtractor, PinholeCamera, PixelFormat, Prediction,
-    RansacConfig, RgbdFrame, estimate_pose, match_descriptors, match_guided,
+    Correspondence, DepthConfig, Descriptor, Feature, FeatureConfig, Match, MatchingConfig,
+    OrbExtractor, Prediction, RansacConfig, estimate_pose, match_descriptors, match_guided,
 };
 use nalgebra::{
     Isometry3, Matrix3, Matrix6, Point3, Quaternion, Rotation3, Translation3, UnitQuaternion,

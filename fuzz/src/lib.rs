@@ -5,7 +5,7 @@ use std::path::Path;
 
 use mfg_vio::dataset::{Assumed, LogConfig, convert, inspect, open};
 use mfg_vio::inertial::ImuConfig;
-use mfg_vio::vision::CameraConfig;
+use mfg_vio::sensor::CameraConfig;
 
 /// Writes `bytes` to a file, after `magic` where they do not begin so, and reads it.
 pub fn file(magic: &[u8], bytes: &[u8]) {

@@ -12,8 +12,8 @@ use mfg_vio::evaluation::{NeesSummary, Table};
 use mfg_vio::filter::gnss::{
     GnssConfig, GnssFilterKind, NavigationStep, NavigationSummary, OutageConfig, navigate,
 };
-use mfg_vio::inertial::{ImuSample, PositionFix};
 use mfg_vio::replay::NavigationOutputs;
+use mfg_vio::sensor::{ImuSample, PositionFix};
 
 /// Share of a chi-square distribution within the bounds that are printed.
 const CONFIDENCE: f64 = 0.95;

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Assumed, Inspection, LogSummary, Severity, TopicInspection};
-use mfg_vio::vision::CameraConfig;
+use mfg_vio::sensor::CameraConfig;
 
 /// Tell what is in a log and whether it is fit for visual-inertial odometry.
 ///

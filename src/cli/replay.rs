@@ -8,16 +8,15 @@ use super::terminal::{INTERRUPTED, catch_interrupts, progress};
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Fault, LogSummary};
 use mfg_vio::filter::{FilterKind, MapTreatment};
-#[cfg(feature = "viewer")]
-use mfg_vio::inertial::ImuSample;
 use mfg_vio::odometry::{InitMode, StepReport};
 use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
+#[cfg(feature = "viewer")]
+use mfg_vio::sensor::{ImuSample, PinholeCamera, RgbdFrame};
 use mfg_vio::viewer::{Contents, Purpose};
 #[cfg(feature = "viewer")]
 use mfg_vio::viewer::{Recorder, Sink};
 #[cfg(feature = "viewer")]
-use mfg_vio::vision::PinholeCamera;
-use mfg_vio::vision::{OrbExtractor, RgbdFrame};
+use mfg_vio::vision::OrbExtractor;
 
 /// Run the estimator over a log of RGB-D frames and IMU samples.
 ///

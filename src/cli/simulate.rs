@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::terminal::{INTERRUPTED, catch_interrupts, progress};
 use mfg_vio::dataset::{LogWriter, WriteSummary};
-use mfg_vio::odometry::Event;
+use mfg_vio::sensor::Event;
 use mfg_vio::simulation::{SceneConfig, Simulation};
 
 /// Render an RGB-D + IMU log with ground truth.

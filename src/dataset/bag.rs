@@ -7,7 +7,7 @@ use super::message::{MessageType, Serialization};
 use super::records::{ChunkHead, Format, MessageHead, RecordHead, RecordKind, Records};
 use super::ros::Channel;
 use super::section::{LogFile, fill, invalid, read_array};
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// The messages of a bag.
 pub(super) type Bag = Records<BagFormat>;

@@ -21,7 +21,7 @@ use super::{
     Event, LogConfig, LogError, LogWriter, LogWriterOptions, ReadReport, WriteError, open,
 };
 use crate::inertial::ImuConfig;
-use crate::vision::CameraConfig;
+use crate::sensor::CameraConfig;
 
 /// Level of the zstd compression: images hardly shrink further with higher ones.
 const COMPRESSION_LEVEL: u32 = 1;

@@ -10,8 +10,8 @@ use super::folder::{Entry, Listing, read_text};
 use super::message::isometry;
 use super::pixels::Rejection;
 use super::{LogConfig, LogError, LogSummary, TruthPose};
-use crate::inertial::{ImuSample, Stamp};
-use crate::vision::{CameraConfig, StereoRig};
+use crate::sensor::{CameraConfig, ImuSample, Stamp};
+use crate::vision::StereoRig;
 
 const LEFT: &str = "cam0";
 const RIGHT: &str = "cam1";

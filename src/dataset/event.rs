@@ -3,9 +3,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::inertial::Stamp;
-use crate::odometry::Event;
-use crate::vision::CameraConfig;
+use crate::sensor::{CameraConfig, Event, Stamp};
 
 /// What a reader met: counts that end up in `metrics.json`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]

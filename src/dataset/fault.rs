@@ -11,8 +11,8 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::ReadReport;
 use super::merge::{Reading, ReadingSource};
-use crate::inertial::{ImuConfig, ImuSample, Stamp};
-use crate::vision::{ColorImage, DepthImage};
+use crate::inertial::ImuConfig;
+use crate::sensor::{ColorImage, DepthImage, ImuSample, Stamp};
 
 /// What goes wrong. What the amount of a [`Fault`] means is in brackets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -365,7 +365,7 @@ fn moved(mut reading: Reading, seconds: f64) -> Reading {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::vision::PixelFormat;
+    use crate::sensor::PixelFormat;
 
     /// Two seconds of an IMU at 100 Hz and of images of 4x1 pixels at 10 Hz.
     struct Readings(std::vec::IntoIter<Reading>);

@@ -7,7 +7,8 @@ use super::pair::{Paired, Pairer};
 use super::pixels::{Rejection, compressed_color, compressed_depth};
 use super::ros::Role;
 use super::{LogConfig, LogError, ReadReport, TruthPose};
-use crate::inertial::{ImuConfig, ImuSample, Stamp};
+use crate::inertial::ImuConfig;
+use crate::sensor::{ImuSample, Stamp};
 use crate::vision::StereoRig;
 
 /// Files larger than this are not images of a log, bytes.
@@ -115,7 +116,7 @@ pub(super) fn read_entry(
 ) -> Result<Reading, Rejection> {
     let (path, reading) = match entry {
         Entry::Truth(pose) => return Ok(Reading::Truth(*pose)),
-        Entry::Imu(sample) => return Ok(Reading::Imu(sample.scaled(imu))),
+        Entry::Imu(sample) => return Ok(Reading::Imu(imu.in_si_units(&sample))),
         Entry::Color(path) => {
             let image = read_file(path).and_then(|bytes| compressed_color(&bytes));
             (path, image.map(|image| Reading::Color(stamp, image)))

@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 
 use super::LogError;
 use super::text_table::{Row, TextTable, fields};
-use crate::inertial::ImuSample;
+use crate::sensor::ImuSample;
 
 const COLUMNS: [&str; 10] = ["t", "gx", "gy", "gz", "ax", "ay", "az", "mx", "my", "mz"];
 /// Columns that must be there.

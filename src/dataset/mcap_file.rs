@@ -12,7 +12,7 @@ use super::message::{MessageType, Serialization};
 use super::records::{ChunkHead, Format, MessageHead, RecordHead, RecordKind, Records};
 use super::ros::Channel;
 use super::section::{LogFile, fill, invalid, read_array, skip};
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// The messages of an MCAP file.
 pub(super) type McapFile = Records<McapFormat>;

@@ -4,8 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use super::pair::{Paired, Pairer};
 use super::{Event, Log, LogConfig, LogSummary, ReadReport, RgbdFrame, TruthPose};
-use crate::inertial::{ImuSample, Stamp};
-use crate::vision::{ColorImage, DepthImage};
+use crate::sensor::{ColorImage, DepthImage, ImuSample, Stamp};
 
 /// One message of a stream that is used, decoded.
 #[derive(Debug, Clone, PartialEq)]
@@ -341,7 +340,7 @@ mod tests {
 
     use super::super::samples::read_all;
     use super::*;
-    use crate::vision::PixelFormat;
+    use crate::sensor::PixelFormat;
 
     struct Readings(std::vec::IntoIter<Reading>);
 

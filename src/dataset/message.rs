@@ -8,7 +8,8 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 
 use super::TruthPose;
 use super::pixels::{RawImage, Rejection};
-use crate::inertial::{ImuConfig, ImuSample, Stamp};
+use crate::inertial::ImuConfig;
+use crate::sensor::{ImuSample, Stamp};
 
 /// How the messages of a channel are serialised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -217,7 +218,8 @@ pub(super) fn imu(mut fields: Fields, config: &ImuConfig) -> Result<ImuSample, R
             return Err(Rejection::new("no gyroscope or no accelerometer in the message", detail));
         }
     }
-    let sample = ImuSample { stamp, angular_velocity, specific_force: acceleration }.scaled(config);
+    let logged = ImuSample { stamp, angular_velocity, specific_force: acceleration };
+    let sample = config.in_si_units(&logged);
     if !sample.is_finite() {
         return Err(Rejection::new("not finite", format!("at {stamp} s")));
     }

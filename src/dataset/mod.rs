@@ -33,8 +33,7 @@ mod text_table;
 mod tum;
 mod write;
 
-use crate::odometry::{Event, TruthPose};
-use crate::vision::RgbdFrame;
+use crate::sensor::{Event, RgbdFrame, TruthPose};
 
 pub use convert::{ConvertError, ConvertSummary, convert};
 pub use event::{Log, LogConfig, LogError, LogSummary, ReadReport};

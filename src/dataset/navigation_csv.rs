@@ -17,7 +17,7 @@ use nalgebra::Vector3;
 
 use super::LogError;
 use super::text_table::{Row, TextTable, fields};
-use crate::inertial::{ImuSample, PositionFix};
+use crate::sensor::{ImuSample, PositionFix};
 
 const STAMP: &[&str] = &["t", "time", "timestamp", "stamp"];
 const RATE: &[[&str; 3]] = &[

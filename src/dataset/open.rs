@@ -185,7 +185,7 @@ mod tests {
     use super::super::samples::{self, Sample, read_all};
     use super::super::{Assumed, Event, RgbdFrame, convert, inspect};
     use super::*;
-    use crate::vision::CameraConfig;
+    use crate::sensor::CameraConfig;
 
     fn open_default(path: &Path) -> Result<Box<dyn Log>, LogError> {
         open(path, &LogConfig::default(), &ImuConfig::default())
@@ -250,7 +250,7 @@ mod tests {
             assert_eq!(log.report().truth_poses, 10);
             let frames = frames(&events);
             assert_eq!(frames.len(), 5);
-            assert_eq!(frames[4].stamp, crate::inertial::Stamp::from_parts(1, 400_000_000));
+            assert_eq!(frames[4].stamp, crate::sensor::Stamp::from_parts(1, 400_000_000));
             assert_eq!(frames[4].color.data(), [14; 24]);
             assert_eq!(frames[4].depth.data(), [14 * 257; 8]);
             assert!(first.as_ref().is_none_or(|first| *first == events));

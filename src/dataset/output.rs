@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use mcap::records::MessageHeader;
 
 use super::WriteError;
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// A chunk is written when its messages reach this size, bytes.
 const CHUNK_SIZE: u64 = 4 << 20;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// What became of an image.
 #[derive(Debug, PartialEq)]

@@ -5,7 +5,7 @@ use std::io::Cursor;
 use image::{DynamicImage, ImageFormat, ImageReader, Limits};
 
 use super::LogConfig;
-use crate::vision::{ColorImage, DepthImage, PixelFormat};
+use crate::sensor::{ColorImage, DepthImage, PixelFormat};
 
 /// Why a message was left out: a fixed reason to count by, and what was wrong in this one.
 #[derive(Debug, Clone, PartialEq)]

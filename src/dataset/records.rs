@@ -7,7 +7,7 @@ use std::io::{self, BufRead, BufReader, Read};
 use super::ReadReport;
 use super::ros::{Channel, Message, MessageSource, Place, Visitor};
 use super::section::{LogFile, Section, fill, skip};
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// What a record is to the reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

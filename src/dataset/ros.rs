@@ -12,8 +12,9 @@ use super::pixels::{
 };
 use super::write::{CAMERA, CONFIGURATION};
 use super::{LogConfig, LogError, LogSummary, ReadReport};
-use crate::inertial::{ImuConfig, Stamp};
-use crate::vision::{CameraConfig, PixelFormat, StereoRig};
+use crate::inertial::ImuConfig;
+use crate::sensor::{CameraConfig, PixelFormat, Stamp};
+use crate::vision::StereoRig;
 
 /// A connection of a bag or a channel of an MCAP file.
 #[derive(Debug, Clone, PartialEq)]

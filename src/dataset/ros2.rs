@@ -4,8 +4,7 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
 use serde::{Serialize, Serializer};
 
 use super::message::MessageType;
-use crate::inertial::Stamp;
-use crate::vision::{CameraConfig, ColorImage};
+use crate::sensor::{CameraConfig, ColorImage, Stamp};
 
 #[derive(Serialize)]
 pub struct Header {

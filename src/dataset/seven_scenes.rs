@@ -10,7 +10,7 @@ use nalgebra::{Isometry3, Matrix3, Matrix4, Rotation3, Translation3, UnitQuatern
 use super::folder::{Entry, Listing, read_text};
 use super::pixels::Rejection;
 use super::{LogConfig, LogError, LogSummary, TruthPose};
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// Nominal rate of the camera, Hz.
 const FRAME_RATE: i64 = 30;

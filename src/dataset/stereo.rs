@@ -5,8 +5,8 @@ use std::collections::VecDeque;
 use super::merge::{Reading, ReadingSource};
 use super::pair::{Paired, Pairer};
 use super::{LogConfig, ReadReport};
-use crate::inertial::Stamp;
-use crate::vision::{ColorImage, StereoRig};
+use crate::sensor::{ColorImage, Stamp};
+use crate::vision::StereoRig;
 
 /// Replaces the images of the two cameras by the rectified left one and its depth.
 pub(super) struct StereoSource<S> {

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::Vector3;
 
 use super::LogError;
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// The lines of a file.
 #[derive(Debug)]

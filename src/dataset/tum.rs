@@ -9,7 +9,7 @@ use super::folder::{Entry, Listing, read_text};
 use super::message::isometry;
 use super::pixels::Rejection;
 use super::{LogConfig, LogError, LogSummary, TruthPose};
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 const COLOR_LIST: &str = "rgb.txt";
 const DEPTH_LIST: &str = "depth.txt";

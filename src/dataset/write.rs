@@ -11,8 +11,7 @@ use super::definition::CDR_HEADER;
 use super::output::McapOutput;
 use super::ros2;
 use super::{Event, RgbdFrame, TruthPose};
-use crate::inertial::{ImuSample, Stamp};
-use crate::vision::{CameraConfig, ColorImage, DepthImage, PixelFormat};
+use crate::sensor::{CameraConfig, ColorImage, DepthImage, ImuSample, PixelFormat, Stamp};
 
 /// How a log departs from what the messages' definitions say.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]

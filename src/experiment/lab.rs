@@ -21,13 +21,12 @@ use crate::filter::{
     Calibration, FilterConfig, FilterKind, MapTreatment, SeenPoint, VisualInertialFilter,
     calibration_block,
 };
-use crate::inertial::{
-    Belief, ImuConfig, ImuSample, NavCovariance, NavState, Propagator, Stamp, block,
-};
+use crate::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator, block};
 use crate::map::{Map, MapConfig, Sighting};
 use crate::odometry::renew_state_points;
+use crate::sensor::{ImuSample, PinholeCamera, Stamp};
 use crate::simulation::{BodyState, ImuSimulator, Motion, MotionConfig, SceneConfig, SceneError};
-use crate::vision::{DepthReading, Descriptor, PinholeCamera, PointMeasurement};
+use crate::vision::{DepthReading, Descriptor, PointMeasurement};
 
 /// Studies of this module.
 pub const STUDIES: &[Study] = &[

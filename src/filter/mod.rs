@@ -16,5 +16,5 @@ pub use visual::{
     BodyPoints, Calibration, Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude,
     MapRefinement, MapTreatment, Mekf, MfgFilter, MotionSpread, PointState, Rest, Screening,
     SeenPoint, SlamFilter, UpdateMethod, UpdateOutcome, VisualInertialFilter, calibration_block,
-    choose_points, point_by_pose, pose_covariance,
+    choose_points, point_by_pose,
 };

@@ -1,6 +1,6 @@
 //! Gaps in the IMU's data, filled in or not.
 
-use super::ImuSample;
+use crate::sensor::ImuSample;
 
 /// Whether the IMU was there between two samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -68,7 +68,7 @@ fn alike(a: &ImuSample, b: &ImuSample) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::inertial::Stamp;
+    use crate::sensor::Stamp;
     use nalgebra::Vector3;
 
     /// At 100 Hz, with readings that are never straight.

@@ -1,54 +1,6 @@
-use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use super::Stamp;
-
-/// One reading of the inertial measurement unit, in SI units, biases and noise included.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ImuSample {
-    pub stamp: Stamp,
-    /// Angular velocity of the body in body coordinates, rad/s.
-    pub angular_velocity: Vector3<f64>,
-    /// Specific force `R^T (a - g)` in body coordinates, m/s^2.
-    pub specific_force: Vector3<f64>,
-}
-
-impl ImuSample {
-    /// A reading as logged, in SI units.
-    pub fn scaled(&self, config: &ImuConfig) -> Self {
-        Self {
-            stamp: self.stamp,
-            angular_velocity: self.angular_velocity * config.gyroscope_scale,
-            specific_force: self.specific_force * config.accelerometer_scale,
-        }
-    }
-
-    /// The reading at `stamp` on the line between two samples; the later one where they are not
-    /// apart.
-    pub fn between(from: &Self, to: &Self, stamp: Stamp) -> Self {
-        let interval = to.stamp.seconds_since(from.stamp);
-        let fraction =
-            if interval > 0.0 { stamp.seconds_since(from.stamp) / interval } else { 1.0 };
-        Self {
-            stamp,
-            angular_velocity: from.angular_velocity.lerp(&to.angular_velocity, fraction),
-            specific_force: from.specific_force.lerp(&to.specific_force, fraction),
-        }
-    }
-
-    pub fn is_finite(&self) -> bool {
-        let finite = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
-        finite(&self.angular_velocity) && finite(&self.specific_force)
-    }
-}
-
-/// A position measured by a GNSS receiver.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PositionFix {
-    pub stamp: Stamp,
-    /// World coordinates (local, z up), m.
-    pub position: Vector3<f64>,
-}
+use crate::sensor::ImuSample;
 
 /// Units and noise of the IMU. Noise densities are continuous-time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -96,6 +48,17 @@ impl Default for ImuConfig {
             max_gap: 0.1,
             gap_gyro_noise: 0.3,
             gap_accel_noise: 1.0,
+        }
+    }
+}
+
+impl ImuConfig {
+    /// A reading as logged, in SI units.
+    pub fn in_si_units(&self, logged: &ImuSample) -> ImuSample {
+        ImuSample {
+            stamp: logged.stamp,
+            angular_velocity: logged.angular_velocity * self.gyroscope_scale,
+            specific_force: logged.specific_force * self.accelerometer_scale,
         }
     }
 }

@@ -1,7 +1,7 @@
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::ImuSample;
+use crate::sensor::ImuSample;
 use crate::so3;
 
 /// When an IMU counts as standing still.
@@ -173,7 +173,7 @@ impl InitialAttitude {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::inertial::Stamp;
+    use crate::sensor::Stamp;
     use approx::assert_relative_eq;
 
     fn samples(rate: Vector3<f64>, up: impl Fn(f64) -> Vector3<f64>) -> Vec<ImuSample> {

@@ -1,5 +1,5 @@
-//! Sensor time, IMU samples and their noise, and how a belief about the motion of the body is
-//! carried through the kinematics.
+//! Noise and biases of the IMU, and how a belief about the motion of the body is carried through
+//! the kinematics.
 
 mod coverage;
 mod directions;
@@ -7,7 +7,6 @@ mod imu;
 mod initial;
 mod noise;
 mod propagation;
-mod stamp;
 mod state;
 
 pub use coverage::Coverage;
@@ -15,10 +14,9 @@ pub use directions::{
     BodyDirection, DirectionConfig, DirectionFinder, Directions, GravityConfig, MagneticConfig,
     RestConfig,
 };
-pub use imu::{ImuConfig, ImuSample, PositionFix};
+pub use imu::ImuConfig;
 pub use initial::{InitialAttitude, StandstillCheck, StandstillConfig, attitude_from_gravity};
 pub(crate) use noise::DrivingNoise;
 pub(crate) use propagation::symmetrize;
 pub use propagation::{MotionModel, Propagator};
-pub use stamp::Stamp;
-pub use state::{Belief, NavCovariance, NavState, block};
+pub use state::{Belief, NavCovariance, NavState, block, pose_covariance};

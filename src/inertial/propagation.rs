@@ -1,7 +1,8 @@
 use nalgebra::{Isometry3, Matrix3, Matrix6, SMatrix, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{Belief, DrivingNoise, ImuConfig, ImuSample, NavCovariance, NavState, block};
+use super::{Belief, DrivingNoise, ImuConfig, NavCovariance, NavState, block};
+use crate::sensor::ImuSample;
 use crate::so3;
 
 /// What carries the belief between two camera frames.
@@ -276,7 +277,7 @@ pub(crate) fn symmetrize<const N: usize>(matrix: &mut SMatrix<f64, N, N>) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::inertial::Stamp;
+    use crate::sensor::Stamp;
     use nalgebra::SVector;
     use proptest::prelude::*;
 

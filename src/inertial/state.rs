@@ -1,4 +1,4 @@
-use nalgebra::{Isometry3, SMatrix, SVector, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
 
 use crate::distribution::matrix_fisher::MatrixFisher;
 
@@ -14,6 +14,19 @@ pub mod block {
     pub const POSITION: usize = 6;
     pub const GYRO_BIAS: usize = 9;
     pub const ACCEL_BIAS: usize = 12;
+}
+
+/// The (rotation, position) blocks of a [`NavCovariance`].
+pub fn pose_covariance(covariance: &NavCovariance) -> Matrix6<f64> {
+    let mut pose = Matrix6::zeros();
+    let starts = [block::ROTATION, block::POSITION];
+    for (i, from_row) in starts.into_iter().enumerate() {
+        for (j, from_column) in starts.into_iter().enumerate() {
+            pose.fixed_view_mut::<3, 3>(3 * i, 3 * j)
+                .copy_from(&covariance.fixed_view::<3, 3>(from_row, from_column));
+        }
+    }
+    pose
 }
 
 /// Point estimate of what a visual-inertial filter believes.

@@ -3,7 +3,7 @@ use parry3d::math::Vector;
 use parry3d::query::PointQuery;
 use parry3d::shape::HalfSpace;
 
-use crate::vision::PinholeCamera;
+use crate::sensor::PinholeCamera;
 
 /// What an image shows, without near and far limits: four half-spaces through the camera's
 /// centre, in camera coordinates.

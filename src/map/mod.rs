@@ -8,7 +8,8 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Matrix3, Point3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::vision::{Descriptor, Patch, PinholeCamera};
+use crate::sensor::PinholeCamera;
+use crate::vision::{Descriptor, Patch};
 use frustum::Frustum;
 use index::SpatialIndex;
 

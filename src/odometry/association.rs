@@ -10,8 +10,9 @@ use super::{FrontEndFrame, OdometryConfig};
 use crate::alignment::PointPair;
 use crate::filter::SeenPoint;
 use crate::map::{MapPoint, ReferenceView};
+use crate::sensor::PinholeCamera;
 use crate::vision::ransac::{Consensus, Reprojection};
-use crate::vision::{Correspondence, DepthReading, Feature, PinholeCamera, PointMeasurement};
+use crate::vision::{Correspondence, DepthReading, Feature, PointMeasurement};
 
 /// What the stages of a frame need to know besides the belief and the map.
 pub(super) struct View<'a> {
@@ -248,11 +249,9 @@ pub(super) fn point_pair(correspondence: &Correspondence, view: &View) -> PointP
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::inertial::Stamp;
     use crate::map::{Map, MapConfig, Sighting};
-    use crate::vision::{
-        ColorImage, DepthImage, Descriptor, Extraction, PixelFormat, Pyramid, RgbdFrame,
-    };
+    use crate::sensor::{ColorImage, DepthImage, PixelFormat, RgbdFrame, Stamp};
+    use crate::vision::{Descriptor, Extraction, Pyramid};
     use nalgebra::UnitQuaternion;
 
     const SIZE: (usize, usize) = (320, 240);
@@ -297,7 +296,7 @@ mod tests {
         let config = OdometryConfig::default();
         let camera = PinholeCamera { fx: 300.0, fy: 300.0, cx: 160.0, cy: 120.0 };
         let config = OdometryConfig {
-            camera: crate::vision::CameraConfig {
+            camera: crate::sensor::CameraConfig {
                 fx: 300.0,
                 fy: 300.0,
                 cx: 160.0,

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use nalgebra::{UnitQuaternion, Vector3};
 
 use super::{Note, NoteLevel};
-use crate::inertial::{ImuSample, Stamp};
+use crate::sensor::{ImuSample, Stamp};
 
 /// Intervals within these multiples of the usual one are regular.
 const REGULAR: std::ops::Range<f64> = 0.7..1.4;

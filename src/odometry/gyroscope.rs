@@ -4,7 +4,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 
 use super::watch::MAX_RATE;
 use super::{Note, NoteLevel};
-use crate::inertial::{ImuSample, Stamp};
+use crate::sensor::{ImuSample, Stamp};
 
 /// Turns smaller than this tell nothing, rad.
 const LEAST_TURN: f64 = 0.02;

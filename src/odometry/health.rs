@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Note, NoteLevel};
-use crate::inertial::{Belief, Stamp, block};
+use crate::inertial::{Belief, block};
+use crate::sensor::Stamp;
 
 /// What is done about an estimate that has diverged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

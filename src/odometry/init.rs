@@ -9,9 +9,10 @@ use serde::{Deserialize, Serialize};
 use super::truth::{TruthConfig, TruthTrack, Up, z_up_from_reference};
 use crate::filter::{FilterConfig, KnownAttitude};
 use crate::inertial::{
-    Belief, ImuConfig, ImuSample, InitialAttitude, NavCovariance, NavState, Stamp, StandstillCheck,
-    StandstillConfig, block,
+    Belief, ImuConfig, InitialAttitude, NavCovariance, NavState, StandstillCheck, StandstillConfig,
+    block,
 };
+use crate::sensor::{ImuSample, Stamp};
 
 /// Where the first attitude comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

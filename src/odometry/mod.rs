@@ -2,7 +2,6 @@
 
 mod association;
 mod clock;
-mod event;
 mod gyroscope;
 mod health;
 mod init;
@@ -22,9 +21,9 @@ use serde::{Deserialize, Serialize};
 use crate::filter::FilterConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
-use crate::vision::{CameraConfig, DepthConfig, MatchingConfig, PatchConfig, RansacConfig};
+use crate::sensor::CameraConfig;
+use crate::vision::{DepthConfig, MatchingConfig, PatchConfig, RansacConfig};
 
-pub use event::{Event, TruthPose};
 pub use health::{DivergencePolicy, HealthConfig, HealthSummary};
 pub use init::{InitConfig, InitMode};
 pub use pipeline::{FrontEndFrame, Odometry, OdometryStats};

@@ -19,18 +19,19 @@ use super::restart::{BIAS_FACTOR, Legacy, Spread};
 use super::shutter::{Shutter, given_pose};
 use super::truth::TruthTrack;
 use super::watch::{Agreement, SensorWatch};
-use super::{OdometryConfig, TruthPose, renew_state_points};
+use super::{OdometryConfig, renew_state_points};
 use crate::alignment::PointPair;
 use crate::filter::{
     Calibration, FilterConfig, FilterKind, KnownAttitude, MapTreatment, PointState, SeenPoint,
     UpdateOutcome, VisualInertialFilter, point_by_pose,
 };
-use crate::inertial::{Belief, ImuConfig, ImuSample, NavCovariance, Propagator, Stamp, block};
+use crate::inertial::{Belief, ImuConfig, NavCovariance, Propagator, block};
 use crate::map::{Map, MapPoint, Sighting};
+use crate::sensor::{ImuSample, PinholeCamera, RgbdFrame, Stamp, TruthPose};
 use crate::so3::ProperSvd;
 use crate::vision::{
-    Correspondence, Extraction, Feature, Match, PinholeCamera, Prediction, RgbdFrame, agree_near,
-    agreeing, estimate_pose, match_guided, ransac,
+    Correspondence, Extraction, Feature, Match, Prediction, agree_near, agreeing, estimate_pose,
+    match_guided, ransac,
 };
 
 /// A frame after the front end.
@@ -1216,7 +1217,7 @@ impl StageClock {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::vision::{ColorImage, DepthImage, PixelFormat};
+    use crate::sensor::{ColorImage, DepthImage, PixelFormat};
 
     fn at(seconds: f64) -> Stamp {
         Stamp::from_seconds(1_305_031_229.0 + seconds).unwrap()

@@ -5,7 +5,8 @@ use nalgebra::Isometry3;
 use super::watch::{MAX_FORCE, MAX_RATE};
 use super::{Note, NoteLevel};
 use crate::filter::{FilterConfig, MotionSpread};
-use crate::inertial::{NavState, Stamp};
+use crate::inertial::NavState;
+use crate::sensor::Stamp;
 
 /// A pose of few matches may be off by so much, m and rad.
 const SLACK: (f64, f64) = (0.1, 0.1);

@@ -4,8 +4,8 @@ use nalgebra::{Isometry3, Matrix3};
 use serde::Serialize;
 
 use crate::filter::{Calibration, Screening};
-use crate::inertial::Stamp;
 use crate::inertial::{NavCovariance, NavState};
+use crate::sensor::Stamp;
 use crate::so3::ProperSvd;
 
 /// What became of a key point.

@@ -6,7 +6,8 @@ use nalgebra::Vector3;
 
 use super::{Note, NoteLevel};
 use crate::filter::Rest;
-use crate::inertial::{ImuConfig, ImuSample, NavState, Stamp, StandstillCheck, StandstillConfig};
+use crate::inertial::{ImuConfig, NavState, StandstillCheck, StandstillConfig};
+use crate::sensor::{ImuSample, Stamp};
 
 /// Share of the window at whose end motion is looked for, so that it is noticed soon.
 const NEWEST: f64 = 0.2;

@@ -2,8 +2,9 @@ use nalgebra::{Matrix3, SVector, UnitQuaternion, Vector3};
 
 use super::health::Divergence;
 use crate::filter::FilterConfig;
-use crate::inertial::{Belief, NavCovariance, NavState, Stamp, block};
+use crate::inertial::{Belief, NavCovariance, NavState, block};
 use crate::map::Map;
+use crate::sensor::Stamp;
 
 /// What an estimate that has diverged leaves to the one that starts in its place.
 pub(super) struct Legacy {

@@ -5,9 +5,9 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 use std::time::Instant;
 
-use super::{Event, FrontEndFrame, Odometry, StepReport};
-use crate::inertial::{ImuSample, Stamp};
-use crate::vision::{Extraction, RgbdFrame};
+use super::{FrontEndFrame, Odometry, StepReport};
+use crate::sensor::{Event, ImuSample, RgbdFrame, Stamp};
+use crate::vision::Extraction;
 
 /// Finds the features of one frame; holds no state that one frame hands to the next.
 pub trait FrontEnd: Send {

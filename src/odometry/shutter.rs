@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, SMatrix, SVector, Vector3};
 
 use crate::inertial::{Belief, NavState, block};
-use crate::vision::CameraConfig;
+use crate::sensor::CameraConfig;
 
 /// Delay of the rows of one image against its stamp, and the motion of the camera meanwhile.
 ///

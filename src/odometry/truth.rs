@@ -5,8 +5,8 @@ use std::collections::VecDeque;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::TruthPose;
-use crate::inertial::{Stamp, attitude_from_gravity};
+use crate::inertial::attitude_from_gravity;
+use crate::sensor::{Stamp, TruthPose};
 
 /// How the reference is to be read.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

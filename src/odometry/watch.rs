@@ -3,7 +3,8 @@
 use nalgebra::Vector3;
 
 use super::{Note, NoteLevel};
-use crate::inertial::{ImuConfig, ImuSample, NavState, Stamp};
+use crate::inertial::{ImuConfig, NavState};
+use crate::sensor::{ImuSample, Stamp};
 use crate::vision::Feature;
 
 /// An alarm is over when nothing has set it off for this long, s.

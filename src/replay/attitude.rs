@@ -13,8 +13,7 @@ use crate::dataset::{self, ImuCsv, ImuRow, Log, LogConfig, LogError};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::filter::Estimate;
 use crate::filter::attitude::{AdaptiveAttitude, AdaptiveConfig, AttitudeFilterKind, AttitudeStep};
-use crate::inertial::Stamp;
-use crate::odometry::Event;
+use crate::sensor::{Event, Stamp};
 
 /// What is asked for.
 pub struct AttitudeRequest<'a> {

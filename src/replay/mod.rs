@@ -26,12 +26,10 @@ pub use report::{Series, figures, report};
 use crate::config::Config;
 use crate::dataset::{self, Fault, Log, LogError, ReadReport};
 use crate::evaluation::{EvaluationError, Similarity, Trajectory, is_vertical, read_trajectory};
-use crate::filter::{FilterKind, pose_covariance};
-use crate::inertial::{ImuSample, Stamp};
-use crate::odometry::{
-    Event, FrontEnd, NoteLevel, Observation, Odometry, RunOptions, StepReport, TruthPose, run,
-};
-use crate::vision::RgbdFrame;
+use crate::filter::FilterKind;
+use crate::inertial::pose_covariance;
+use crate::odometry::{FrontEnd, NoteLevel, Observation, Odometry, RunOptions, StepReport, run};
+use crate::sensor::{Event, ImuSample, RgbdFrame, Stamp, TruthPose};
 use evaluation::evaluate;
 use metrics::{peak_memory_bytes, stage_summaries};
 use outputs::Outputs;

@@ -8,8 +8,9 @@ use nalgebra::{Isometry3, Vector3};
 
 use super::ReplayError;
 use crate::filter::{Calibration, calibration_block};
-use crate::inertial::{NavCovariance, NavState, Stamp, block};
+use crate::inertial::{NavCovariance, NavState, block};
 use crate::odometry::{MapPointView, StepReport};
+use crate::sensor::Stamp;
 
 /// Writes trajectory and state line by line, so that an interrupted run leaves valid files.
 pub struct Outputs {

@@ -8,7 +8,8 @@ use super::render::{DropoutConfig, ImageConfig};
 use super::trajectory::{TrajectoryConfig, TrajectoryError};
 use super::world::{PeopleConfig, RoomConfig};
 use crate::dataset::LogWriterOptions;
-use crate::vision::{CameraConfig, DepthConfig};
+use crate::sensor::CameraConfig;
+use crate::vision::DepthConfig;
 
 /// A scene: the world, the motion through it and the sensors. The defaults are a lab room and
 /// the sensors of VCU-RVI.

@@ -5,7 +5,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::config::ImuSensorConfig;
 use super::motion::BodyState;
-use crate::inertial::{ImuSample, Stamp};
+use crate::sensor::{ImuSample, Stamp};
 
 /// Adds biases and noise to the true motion, sample by sample.
 #[derive(Debug, Clone)]

@@ -9,7 +9,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::config::ImuSensorConfig;
 use super::inertial::ImuSimulator;
 use super::motion::{BodyState, Motion, MotionConfig, MotionKind};
-use crate::inertial::{ImuSample, Stamp};
+use crate::sensor::{ImuSample, Stamp};
 
 /// Half the side of the square around the circle that landmarks lie in, m. The paper says "in a
 /// rectangular shape" without its size.

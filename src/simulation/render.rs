@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use statrs::function::erf::erf_inv;
 
 use super::world::{Solid, View, World};
-use crate::vision::{ColorImage, DepthConfig, DepthImage, PinholeCamera, PixelFormat};
+use crate::sensor::{ColorImage, DepthImage, PinholeCamera, PixelFormat};
+use crate::vision::DepthConfig;
 
 /// The color image.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

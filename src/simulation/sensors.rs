@@ -11,9 +11,7 @@ use super::render::{Renderer, Shot};
 use super::texture::Picture;
 use super::world::{RoomConfig, World};
 use crate::dataset::{LogWriter, WriteError, WriteSummary};
-use crate::inertial::Stamp;
-use crate::odometry::{Event, TruthPose};
-use crate::vision::{PinholeCamera, RgbdFrame};
+use crate::sensor::{Event, PinholeCamera, RgbdFrame, Stamp, TruthPose};
 
 /// Runs through a scene and yields what its sensors see, ordered by stamp.
 pub struct Simulation {
@@ -256,7 +254,8 @@ mod tests {
     use nalgebra::{Matrix2, Point2, Vector2};
 
     use super::*;
-    use crate::vision::{ColorImage, DepthConfig};
+    use crate::sensor::ColorImage;
+    use crate::vision::DepthConfig;
 
     /// A quarter-size camera in a small room, without noise.
     fn small_scene() -> SceneConfig {

@@ -10,8 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::motion::BodyState;
 use super::spline::{Smoothing, Spline};
-use crate::inertial::Stamp;
-use crate::odometry::TruthPose;
+use crate::sensor::{Stamp, TruthPose};
 
 /// A recorded trajectory to move along instead of a built-in motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

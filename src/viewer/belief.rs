@@ -11,8 +11,7 @@ use rerun::{
 use super::scene::point;
 use super::sphere::Sphere;
 use crate::distribution::matrix_fisher::MatrixFisher;
-use crate::filter::pose_covariance;
-use crate::inertial::Belief;
+use crate::inertial::{Belief, pose_covariance};
 use crate::odometry::StepReport;
 use crate::so3::ProperSvd;
 

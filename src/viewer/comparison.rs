@@ -17,7 +17,7 @@ use super::recorder::{APPLICATION, check_complete, open};
 use super::timeline::Clock;
 use super::{Sink, ViewerError, blueprint, layout, scene};
 use crate::evaluation::{PosePairs, Trajectory};
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 const REFERENCE: &str = "world/reference";
 const ERRORS: &str = "plots/error";

@@ -6,7 +6,7 @@ use rerun::components::MediaType;
 use rerun::{EncodedDepthImage, EncodedImage};
 
 use super::ViewerError;
-use crate::vision::{ColorImage, DepthImage, PixelFormat};
+use crate::sensor::{ColorImage, DepthImage, PixelFormat};
 
 /// Depths from 0 to this (m) share the color scale, so that a color means the same in all frames.
 const DEPTH_COLOR_RANGE: f64 = 5.0;

@@ -8,8 +8,9 @@ use rerun::{RecordingStream, RecordingStreamResult, Scalars, SeriesLines, TimeCo
 use super::covariance::{diagonal_block, principal_axes, standard_deviations};
 use super::timeline::{Clock, FRAME};
 use crate::evaluation::normalised_square;
-use crate::inertial::{ImuSample, Stamp, block};
+use crate::inertial::block;
 use crate::odometry::StepReport;
+use crate::sensor::{ImuSample, Stamp};
 
 /// One plot: an entity whose every row holds one number a series.
 pub(super) struct Plot {

@@ -18,9 +18,8 @@ use super::scene::{self, Scene};
 use super::sphere::Sphere;
 use super::timeline::{Clock, FRAME, TIME};
 use super::{Contents, RecordingConfig, ViewerError, belief, blueprint, image, plots};
-use crate::inertial::{ImuSample, Stamp};
 use crate::odometry::StepReport;
-use crate::vision::{ColorImage, DepthImage, PinholeCamera, RgbdFrame};
+use crate::sensor::{ColorImage, DepthImage, ImuSample, PinholeCamera, RgbdFrame, Stamp};
 
 /// Viewers keep the layout that a user has arranged by the application's name.
 pub(super) const APPLICATION: &str = "mfg-vio";

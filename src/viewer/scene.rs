@@ -10,7 +10,7 @@ use rerun::{
 use super::covariance::{diagonal_block, principal_axes};
 use crate::inertial::block;
 use crate::odometry::{Note, NoteLevel, StepReport};
-use crate::vision::PinholeCamera;
+use crate::sensor::PinholeCamera;
 
 pub(super) const WORLD: &str = "world";
 pub(super) const IMAGE: &str = "world/estimate/body/camera/image";

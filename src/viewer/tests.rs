@@ -13,12 +13,14 @@ use rerun::external::re_log_encoding::{Decodable as _, DecoderApp, StreamFooter}
 use rerun::log::{Chunk, LogMsg};
 
 use super::*;
-use crate::inertial::{ImuSample, NavCovariance, NavState, Stamp, block};
+use crate::inertial::{NavCovariance, NavState, block};
 use crate::odometry::{
     KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
 };
+use crate::sensor::{
+    ColorImage, DepthImage, ImuSample, PinholeCamera, PixelFormat, RgbdFrame, Stamp,
+};
 use crate::so3::ProperSvd;
-use crate::vision::{ColorImage, DepthImage, PinholeCamera, PixelFormat, RgbdFrame};
 
 const SIZE: [usize; 2] = [320, 240];
 const CAMERA: PinholeCamera = PinholeCamera { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5 };

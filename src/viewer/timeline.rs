@@ -2,7 +2,7 @@
 
 use rerun::{TimeCell, TimeColumn};
 
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// Sensor time.
 pub(super) const TIME: &str = "time";

@@ -1,7 +1,7 @@
 use nalgebra::{Matrix3, Point2, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::DepthImage;
+use crate::sensor::DepthImage;
 
 /// Half the side of the window that a surface is fitted to, pixels.
 const WINDOW_RADIUS: isize = 2;

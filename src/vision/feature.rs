@@ -3,7 +3,8 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Point2, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-use super::{DepthReading, Patch, PinholeCamera, Pyramid};
+use super::{DepthReading, Patch, Pyramid};
+use crate::sensor::PinholeCamera;
 
 /// A 256-bit binary descriptor (ORB, BRIEF, ...).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]

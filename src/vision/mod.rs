@@ -1,13 +1,10 @@
-//! Images, cameras and depth; features, their matching and the search for a consistent pose;
+//! Depth, features, their matching and the search for a consistent pose;
 //! with the feature `vision`, the ORB front end.
 //!
 //! OpenCV is mentioned only inside the feature-gated part of this module.
 
-mod camera;
 mod depth;
 mod feature;
-mod frame;
-mod image;
 mod matching;
 #[cfg(feature = "vision")]
 mod orb;
@@ -18,11 +15,8 @@ pub mod ransac;
 mod select;
 mod stereo;
 
-pub use camera::{CameraConfig, PinholeCamera};
 pub use depth::{DepthConfig, DepthReading};
 pub use feature::{Descriptor, Extraction, Feature, FeatureConfig, PointMeasurement};
-pub use frame::RgbdFrame;
-pub use image::{ColorImage, DepthImage, PixelFormat};
 pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
 #[cfg(feature = "vision")]
 pub use orb::{OrbExtractor, VisionError};

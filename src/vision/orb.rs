@@ -13,13 +13,10 @@ use opencv::features2d::{
 use opencv::prelude::*;
 use opencv::{calib3d, imgproc};
 
-use super::RgbdFrame;
 use super::pyramid::full_pixel;
 use super::select::{Corner, spread};
-use super::{
-    CameraConfig, DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Patch,
-    PinholeCamera, PixelFormat, Pyramid,
-};
+use super::{DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Patch, Pyramid};
+use crate::sensor::{CameraConfig, PinholeCamera, PixelFormat, RgbdFrame};
 
 /// Radius of the patch that orientation and descriptor are computed from, pixels of the level.
 const PATCH_RADIUS: usize = 15;
@@ -377,8 +374,8 @@ fn orientation(pixels: &[u8], stride: usize, corner: &Corner) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::inertial::Stamp;
-    use crate::vision::{ColorImage, DepthImage, MatchingConfig, match_descriptors};
+    use crate::sensor::{ColorImage, DepthImage, Stamp};
+    use crate::vision::{MatchingConfig, match_descriptors};
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 

@@ -9,8 +9,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::{PinholeCamera, PointMeasurement};
+use super::PointMeasurement;
 use crate::alignment::{WeightedPair, weighted_kabsch};
+use crate::sensor::PinholeCamera;
 
 /// Makes a model from some of the data.
 pub trait Estimator {

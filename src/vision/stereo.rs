@@ -8,7 +8,7 @@ use std::ops::RangeInclusive;
 
 use nalgebra::{Isometry3, Matrix3, Point2, Rotation3, Vector3};
 
-use super::{CameraConfig, ColorImage, DepthImage, PinholeCamera, PixelFormat};
+use crate::sensor::{CameraConfig, ColorImage, DepthImage, PinholeCamera, PixelFormat};
 
 /// Half the sides of the window that is compared, pixels.
 const HALF_WIDTH: usize = 5;

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::vision::{ColorImage, DepthImage, PixelFormat};
+use crate::sensor::{ColorImage, DepthImage, PixelFormat};
 
 /// Mean brightness below which an image is dark, of 255.
 const DARK: f64 = 12.0;

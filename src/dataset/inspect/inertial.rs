@@ -3,8 +3,7 @@
 use nalgebra::{Isometry3, Matrix4, UnitQuaternion, Vector3, Vector4};
 use serde::Serialize;
 
-use crate::inertial::ImuSample;
-use crate::odometry::TruthPose;
+use crate::sensor::{ImuSample, TruthPose};
 
 /// Samples and poses beyond this number are not looked at.
 const MOST_SAMPLES: usize = 100_000;
@@ -264,7 +263,7 @@ fn sign_by_mounting(
 }
 
 /// The pose between two reference poses.
-fn pose_at(truth: &[TruthPose], stamp: crate::inertial::Stamp) -> Option<Isometry3<f64>> {
+fn pose_at(truth: &[TruthPose], stamp: crate::sensor::Stamp) -> Option<Isometry3<f64>> {
     let after = truth.partition_point(|pose| pose.stamp <= stamp);
     let (before, after) = (truth.get(after.checked_sub(1)?)?, truth.get(after)?);
     let step = after.stamp.seconds_since(before.stamp);
@@ -372,7 +371,7 @@ fn gyroscope_unit(samples: &[ImuSample], truth: &[TruthPose]) -> GyroscopeUnit {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::inertial::Stamp;
+    use crate::sensor::Stamp;
     use crate::simulation::{Motion, MotionConfig, MotionKind};
 
     /// 10 s of a motion: samples times `scales` (accelerometer, gyroscope), reference in a world

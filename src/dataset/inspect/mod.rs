@@ -24,8 +24,9 @@ use super::pair::{Paired, Pairer};
 use super::pixels::Rejection;
 use super::ros::{Message, Role, Survey, decode, encoding_and_size};
 use super::{LogConfig, LogError, LogSummary, ReadReport};
-use crate::inertial::{ImuConfig, Stamp};
-use crate::vision::{ColorImage, StereoRig};
+use crate::inertial::ImuConfig;
+use crate::sensor::{ColorImage, Stamp};
+use crate::vision::StereoRig;
 
 pub use findings::{Finding, Severity, Verdict};
 pub use images::{ColorInspection, DepthInspection};

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 /// Messages of a topic beyond this number are counted, but their times are not kept.
 const MOST_TIMES: usize = 2 << 20;

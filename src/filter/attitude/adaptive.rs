@@ -6,9 +6,8 @@ use super::super::bayes::{
     BayesFilter, Estimate, FilterError, InertialStep, VectorEstimate, VectorMeasurement,
 };
 use super::{AttitudeFilterKind, AttitudePrior, GyroModel};
-use crate::inertial::{
-    BodyDirection, DirectionConfig, DirectionFinder, Directions, ImuSample, Stamp,
-};
+use crate::inertial::{BodyDirection, DirectionConfig, DirectionFinder, Directions};
+use crate::sensor::{ImuSample, Stamp};
 
 /// Settings of [`AdaptiveAttitude`].
 #[derive(Debug, Clone, PartialEq)]

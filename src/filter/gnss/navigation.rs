@@ -6,9 +6,8 @@ use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
 use super::{GnssConfig, GnssFilter, GnssFilterKind, InitialBelief, Innovation};
 use crate::filter::{FilterError, InertialStep};
-use crate::inertial::{
-    Belief, Coverage, ImuSample, InitialAttitude, NavState, PositionFix, Stamp, block,
-};
+use crate::inertial::{Belief, Coverage, InitialAttitude, NavState, block};
+use crate::sensor::{ImuSample, PositionFix, Stamp};
 
 /// Why a run cannot start or go on.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -133,7 +132,7 @@ pub fn navigate(
         return Ok(run.finish());
     }
     for (sample, &coverage) in samples.iter().zip(coverage) {
-        let sample = sample.scaled(&config.imu);
+        let sample = config.imu.in_si_units(sample);
         run.enter(coverage);
         while let Some(fix) = waiting.next_if(|fix| fix.stamp <= sample.stamp) {
             let at_fix = ImuSample::between(&now, &sample, fix.stamp);
@@ -190,7 +189,7 @@ fn find_start<'a>(
         let after = imu.partition_point(|sample| sample.stamp <= fix.stamp);
         let (Some(before), Some(next)) = (imu[..after].last(), imu.get(after)) else { continue };
         if coverage[after] != Coverage::Gap {
-            let [before, next] = [before, next].map(|sample| sample.scaled(&config.imu));
+            let [before, next] = [before, next].map(|sample| config.imu.in_si_units(sample));
             return Ok(Start {
                 origin: ImuSample::between(&before, &next, fix.stamp),
                 samples: &imu[after..],
@@ -354,7 +353,7 @@ fn initial_belief(
     let in_window =
         samples.iter().take_while(|s| s.stamp.seconds_since(origin.stamp) <= start.window);
     let window: Vec<ImuSample> =
-        std::iter::once(*origin).chain(in_window.map(|s| s.scaled(&config.imu))).collect();
+        std::iter::once(*origin).chain(in_window.map(|s| config.imu.in_si_units(s))).collect();
     let (tilt_sd, heading_sd) = (start.tilt_sd.to_radians(), start.heading_sd.to_radians());
     let level = InitialAttitude::level(&window, Vector3::zeros(), tilt_sd, heading_sd)
         .ok_or(NavigationError::Level(fix.stamp))?;

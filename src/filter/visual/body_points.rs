@@ -3,11 +3,10 @@
 use nalgebra::{Matrix3, SMatrix, Vector3};
 
 use super::broad::{EUCLIDEAN, POSITION};
-use super::pose_covariance;
 use crate::alignment::{MapEstimate, PointQuadratic};
 use crate::distribution::regression::RotationRegression;
 use crate::distribution::rotation_quadratic::RotationMoments;
-use crate::inertial::Belief;
+use crate::inertial::{Belief, pose_covariance};
 
 /// Mean and covariance of `R p' + t` for any `p'`, W22 (5.84), (5.85): polynomials in `p'`, whose
 /// coefficients are the same for all points of a frame.

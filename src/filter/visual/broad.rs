@@ -606,8 +606,8 @@ mod tests {
         let mut linear = Belief { state, covariance };
         let mut broad = BroadBelief::of_belief(&linear).unwrap();
         let propagator = Propagator::inertial(&ImuConfig::default());
-        let sample = |k: i64| crate::inertial::ImuSample {
-            stamp: crate::inertial::Stamp::from_nanos(k * 5_000_000),
+        let sample = |k: i64| crate::sensor::ImuSample {
+            stamp: crate::sensor::Stamp::from_nanos(k * 5_000_000),
             angular_velocity: GYRO,
             specific_force: ACCEL,
         };

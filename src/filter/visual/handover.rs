@@ -8,7 +8,8 @@ use super::{
 };
 use crate::alignment::PointPair;
 use crate::distribution::matrix_fisher::MatrixFisher;
-use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator};
+use crate::inertial::{Belief, NavCovariance, Propagator};
+use crate::sensor::ImuSample;
 use crate::so3::ProperSvd;
 
 /// `mfgs` where the attitude at the start is too uncertain for a covariance.
@@ -136,7 +137,8 @@ mod tests {
     use super::*;
     use crate::alignment::MapEstimate;
     use crate::filter::FilterKind;
-    use crate::inertial::{ImuConfig, NavState, Stamp};
+    use crate::inertial::{ImuConfig, NavState};
+    use crate::sensor::Stamp;
     use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 
     #[test]

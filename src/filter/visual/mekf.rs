@@ -5,7 +5,8 @@ use nalgebra::{Matrix6, SMatrix, SVector};
 use super::gate::Gate;
 use super::{FilterConfig, Rest, UpdateOutcome, VisualInertialFilter, normalized_innovation};
 use crate::alignment::{PointPair, PoseInformation};
-use crate::inertial::{Belief, ImuSample, Propagator, block, symmetrize};
+use crate::inertial::{Belief, Propagator, block, symmetrize};
+use crate::sensor::ImuSample;
 use crate::so3::ProperSvd;
 
 /// Attitude error in the body frame, one linearisation an update, at the predicted state.
@@ -31,7 +32,7 @@ impl Mekf {
         let mut by_pose = SMatrix::<f64, 15, 6>::zeros();
         by_pose.fixed_columns_mut::<3>(0).copy_from(&prior.fixed_columns::<3>(block::ROTATION));
         by_pose.fixed_columns_mut::<3>(3).copy_from(&prior.fixed_columns::<3>(block::POSITION));
-        let pose = super::pose_covariance(&prior);
+        let pose = crate::inertial::pose_covariance(&prior);
         let inner = (Matrix6::identity() + lambda * pose).try_inverse()?;
         let correction: SVector<f64, 15> = by_pose * (inner * vector);
         let mut covariance = prior - by_pose * (inner * lambda) * by_pose.transpose();

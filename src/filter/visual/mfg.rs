@@ -12,7 +12,8 @@ use super::{
 };
 use crate::alignment::{PointPair, PoseInformation, rotated_vector_by_rotation, vectorize};
 use crate::distribution::matrix_fisher::MatrixFisher;
-use crate::inertial::{Belief, ImuSample, Propagator, block};
+use crate::inertial::{Belief, Propagator, block};
+use crate::sensor::ImuSample;
 use crate::so3::{ProperSvd, angle_between};
 
 /// Least information about a rotation axis from which on the attitude is carried by its mode and

@@ -21,7 +21,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::alignment::{MapEstimate, PointPair, PoseInformation, RobustKernel};
 use crate::distribution::matrix_fisher::MatrixFisher;
-use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block};
+use crate::inertial::{Belief, NavCovariance, Propagator, block, pose_covariance};
+use crate::sensor::ImuSample;
 use crate::so3::ProperSvd;
 
 pub use body_points::BodyPoints;
@@ -507,19 +508,6 @@ pub fn point_by_pose(rotation: &Matrix3<f64>, in_body: &Vector3<f64>) -> SMatrix
     j.fixed_view_mut::<3, 3>(0, 0).copy_from(&-(rotation * in_body.cross_matrix()));
     j.fixed_view_mut::<3, 3>(0, 3).copy_from(&Matrix3::identity());
     j
-}
-
-/// The (rotation, position) blocks of a [`NavCovariance`].
-pub fn pose_covariance(covariance: &NavCovariance) -> Matrix6<f64> {
-    let mut pose = Matrix6::zeros();
-    let starts = [block::ROTATION, block::POSITION];
-    for (i, from_row) in starts.into_iter().enumerate() {
-        for (j, from_column) in starts.into_iter().enumerate() {
-            pose.fixed_view_mut::<3, 3>(3 * i, 3 * j)
-                .copy_from(&covariance.fixed_view::<3, 3>(from_row, from_column));
-        }
-    }
-    pose
 }
 
 /// Squared normalised innovation per degree of freedom of `information` against the prior:

@@ -16,7 +16,8 @@ use super::{
     point_by_pose,
 };
 use crate::alignment::{MapEstimate, PointPair};
-use crate::inertial::{Belief, ImuSample, NavCovariance, Propagator, block};
+use crate::inertial::{Belief, NavCovariance, Propagator, block};
+use crate::sensor::ImuSample;
 use crate::so3::{self, ProperSvd};
 
 /// Size of the navigation part of the state.
@@ -806,7 +807,8 @@ impl PointState for SlamFilter {
 mod tests {
     use super::*;
     use crate::filter::FilterKind;
-    use crate::inertial::{ImuConfig, NavState, Stamp, attitude_from_gravity};
+    use crate::inertial::{ImuConfig, NavState, attitude_from_gravity};
+    use crate::sensor::Stamp;
     use approx::assert_relative_eq;
     use nalgebra::Translation3;
     use proptest::prelude::*;
@@ -1332,7 +1334,7 @@ mod tests {
         let belief = mfgs.belief();
         let rotation = belief.state.world_from_body.rotation.to_rotation_matrix();
         let j = point_by_pose(rotation.matrix(), &exact.coords);
-        let seen_spread = j * super::super::pose_covariance(&belief.covariance) * j.transpose();
+        let seen_spread = j * crate::inertial::pose_covariance(&belief.covariance) * j.transpose();
         let spread = mfgs.point_state().unwrap().estimate(0).unwrap().covariance;
         assert!((seen_spread - spread).norm() < 1e-3 * spread.norm());
     }

@@ -29,7 +29,7 @@ pub use gravity::GravityConfig;
 pub use magnetic::MagneticConfig;
 pub use rest::RestConfig;
 
-use super::ImuSample;
+use crate::sensor::ImuSample;
 use crate::so3;
 use gravity::GravityFinder;
 use magnetic::MagneticFinder;

@@ -1,7 +1,7 @@
 use nalgebra::{Rotation3, Vector3};
 
 use super::*;
-use crate::inertial::Stamp;
+use crate::sensor::Stamp;
 
 const RATE: f64 = 100.0;
 const FIELD: Vector3<f64> = Vector3::new(0.0, 16e-6, -42e-6);

@@ -1,5 +1,4 @@
-use super::{ColorImage, DepthImage};
-use crate::inertial::Stamp;
+use super::{ColorImage, DepthImage, Stamp};
 
 /// A color image and the depth image registered to it.
 #[derive(Debug, Clone, PartialEq)]

@@ -1,7 +1,6 @@
 use nalgebra::Isometry3;
 
-use crate::inertial::{ImuSample, Stamp};
-use crate::vision::RgbdFrame;
+use super::{ImuSample, RgbdFrame, Stamp};
 
 /// A pose from motion capture or another reference, as logged: its world need not be z-up.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,0 +1,41 @@
+use nalgebra::Vector3;
+
+use super::Stamp;
+
+/// One reading of the inertial measurement unit, in SI units, biases and noise included.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ImuSample {
+    pub stamp: Stamp,
+    /// Angular velocity of the body in body coordinates, rad/s.
+    pub angular_velocity: Vector3<f64>,
+    /// Specific force `R^T (a - g)` in body coordinates, m/s^2.
+    pub specific_force: Vector3<f64>,
+}
+
+impl ImuSample {
+    /// The reading at `stamp` on the line between two samples; the later one where they are not
+    /// apart.
+    pub fn between(from: &Self, to: &Self, stamp: Stamp) -> Self {
+        let interval = to.stamp.seconds_since(from.stamp);
+        let fraction =
+            if interval > 0.0 { stamp.seconds_since(from.stamp) / interval } else { 1.0 };
+        Self {
+            stamp,
+            angular_velocity: from.angular_velocity.lerp(&to.angular_velocity, fraction),
+            specific_force: from.specific_force.lerp(&to.specific_force, fraction),
+        }
+    }
+
+    pub fn is_finite(&self) -> bool {
+        let finite = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
+        finite(&self.angular_velocity) && finite(&self.specific_force)
+    }
+}
+
+/// A position measured by a GNSS receiver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PositionFix {
+    pub stamp: Stamp,
+    /// World coordinates (local, z up), m.
+    pub position: Vector3<f64>,
+}
