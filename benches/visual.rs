@@ -5,9 +5,8 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use mfg_vio::alignment::{PointPair, WeightedPair, align, weighted_kabsch};
-use mfg_vio::filter::{FilterConfig, FilterKind};
+use mfg_vio::filter::{FilterConfig, FilterKind, InertialStep};
 use mfg_vio::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator};
-use mfg_vio::sensor::{ImuSample, Stamp};
 use mfg_vio::so3::exp;
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 
@@ -77,7 +76,7 @@ fn updates(c: &mut Criterion) {
             c.bench_with_input(
                 BenchmarkId::new(format!("update/{kind}"), count),
                 &pairs,
-                |b, pairs| b.iter(|| filter.update(black_box(pairs))),
+                |b, pairs| b.iter(|| filter.update_map_points(black_box(pairs))),
             );
         }
     }
@@ -103,17 +102,17 @@ fn map(c: &mut Criterion) {
 
 fn propagation(c: &mut Criterion) {
     let propagator = Propagator::inertial(&ImuConfig::default());
-    let sample = |nanos: i64| ImuSample {
-        stamp: Stamp::from_nanos(nanos),
+    let interval = InertialStep {
+        seconds: 0.005,
         angular_velocity: Vector3::new(0.1, -0.2, 0.3),
-        specific_force: Vector3::new(0.3, -0.2, 9.8),
+        specific_force: Some(Vector3::new(0.3, -0.2, 9.8)),
     };
     for kind in [FilterKind::Mfgr, FilterKind::Mekfr] {
         c.bench_function(&format!("imu-step/{kind}"), |b| {
             b.iter_batched(
                 || kind.start(&FilterConfig::default(), propagator.clone(), belief()),
                 |mut filter| {
-                    filter.propagate(black_box(&sample(0)), black_box(&sample(5_000_000)));
+                    filter.propagate(black_box(&interval)).unwrap();
                     filter
                 },
                 criterion::BatchSize::SmallInput,

@@ -10,8 +10,9 @@ use crate::filter::FilterConfig;
 use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
-use crate::odometry::{HealthConfig, InitConfig, OdometryConfig, SearchConfig, TruthConfig};
+use crate::odometry::{HealthConfig, InitConfig, OdometryConfig, TruthConfig};
 use crate::sensor::CameraConfig;
+use crate::tracking::SearchConfig;
 use crate::viewer::RecordingConfig;
 use crate::vision::{
     DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig, rectified_camera,

@@ -19,5 +19,6 @@ pub mod replay;
 pub mod sensor;
 pub mod simulation;
 pub mod so3;
+pub mod tracking;
 pub mod viewer;
 pub mod vision;

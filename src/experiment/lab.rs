@@ -14,19 +14,17 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+use super::landmarks::{LandmarkRun, Seen};
 use super::study::{Observation, Report, Request, StepTime, Study, StudyError, Trial, monte_carlo};
-use crate::alignment::PointPair;
 use crate::evaluation::NeesSummary;
 use crate::filter::{
-    Calibration, FilterConfig, FilterKind, MapTreatment, SeenPoint, VisualInertialFilter,
-    calibration_block,
+    Calibration, FilterConfig, FilterError, FilterKind, VisualInertialFilter, calibration_block,
 };
 use crate::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator, block};
-use crate::map::{Map, MapConfig, Sighting};
-use crate::odometry::renew_state_points;
+use crate::map::MapConfig;
 use crate::sensor::{ImuSample, PinholeCamera, Stamp};
 use crate::simulation::{BodyState, ImuSimulator, Motion, MotionConfig, SceneConfig, SceneError};
-use crate::vision::{DepthReading, Descriptor, PointMeasurement};
+use crate::vision::{DepthReading, PointMeasurement};
 
 /// Studies of this module.
 pub const STUDIES: &[Study] = &[
@@ -44,9 +42,9 @@ pub const STUDIES: &[Study] = &[
     },
 ];
 
-const FILTERS: [FilterKind; 4] =
-    [FilterKind::Mfgs, FilterKind::Mekfs, FilterKind::Mfgr, FilterKind::Mekfr];
-const CALIBRATING: [FilterKind; 2] = [FilterKind::Mfgs, FilterKind::Mekfs];
+const FILTERS: [FilterKind; 5] =
+    [FilterKind::Mfgs, FilterKind::Iekfs, FilterKind::Mekfs, FilterKind::Mfgr, FilterKind::Mekfr];
+const CALIBRATING: [FilterKind; 3] = [FilterKind::Mfgs, FilterKind::Iekfs, FilterKind::Mekfs];
 
 /// The drive.
 #[derive(Debug, Clone)]
@@ -83,6 +81,8 @@ impl Default for Lab {
 pub enum LabError {
     #[error(transparent)]
     Scene(#[from] SceneError),
+    #[error(transparent)]
+    Filter(FilterError),
     #[error("{filter}: the belief's covariance is not positive definite at {seconds:.2} s")]
     Covariance { filter: FilterKind, seconds: f64 },
 }
@@ -218,12 +218,12 @@ fn sightings(
     seen
 }
 
-fn in_body(measurement: &PointMeasurement, body_from_camera: &Isometry3<f64>) -> SeenPoint {
-    let rotation = body_from_camera.rotation.to_rotation_matrix();
-    SeenPoint {
-        id: 0,
-        in_body: (body_from_camera * Point3::from(measurement.point)).coords,
-        body_covariance: rotation.matrix() * measurement.covariance * rotation.matrix().transpose(),
+fn in_body(landmark: usize, seen: &PointMeasurement, mounting: &Isometry3<f64>) -> Seen {
+    let rotation = mounting.rotation.to_rotation_matrix();
+    Seen {
+        landmark,
+        in_body: (mounting * Point3::from(seen.point)).coords,
+        body_covariance: rotation.matrix() * seen.covariance * rotation.matrix().transpose(),
     }
 }
 
@@ -366,26 +366,28 @@ fn run(
     let config = FilterConfig { huber: 0.0, ..FilterConfig::default() };
     let mut filter = kind.start(&config, drive.propagator.clone(), drive.start);
     if let Some(prior) = calibration {
-        filter.calibrate(prior);
+        filter.calibrate(prior).map_err(LabError::Filter)?;
     }
-    let mut tracks = Tracks::default();
+    let (map, max_gap) = (MapConfig::default(), ImuConfig::default().max_gap);
+    let mut landmarks = LandmarkRun::start(kind, filter, &config, &map, &drive.imu, max_gap);
     let mut run = Run::default();
-    let mut imu = ImuTrack::new(&drive.imu);
     let clock = Instant::now();
     for (number, frame) in drive.frames.iter().enumerate() {
-        let offset = filter.calibration().map_or(0.0, |estimate| estimate.time_offset);
+        let offset = landmarks.calibration().map_or(0.0, |estimate| estimate.time_offset);
         let time = frame.stamp.offset_by(offset);
-        if !imu.carry(filter.as_mut(), time) {
+        if !landmarks.propagate_to(time) && number > 0 {
             continue;
         }
-        let (treatment, number) = (kind.map_treatment(), number as u64);
-        tracks.see(filter.as_mut(), treatment, number, frame, &drive.body_from_camera, &config);
-        if 2 * number >= drive.frames.len() as u64 {
+        landmarks.see(|back_end| {
+            let mounting = mounting(back_end.filter(), &drive.body_from_camera);
+            frame.seen.iter().map(|(l, m)| in_body(*l, m, &mounting)).collect()
+        });
+        if 2 * number >= drive.frames.len() {
             let degenerate = || LabError::Covariance { filter: kind, seconds: time.seconds() };
             let truth = drive.motion.state(time.seconds());
-            let errors = errors(filter.belief(), &truth).ok_or_else(degenerate)?;
-            run.add(QUANTITIES, errors);
-            if let Some(estimate) = filter.calibration() {
+            let belief = landmarks.back_end.belief();
+            run.add(QUANTITIES, errors(belief, &truth).ok_or_else(degenerate)?);
+            if let Some(estimate) = landmarks.calibration() {
                 let errors = calibration_errors(estimate, &drive.body_from_camera);
                 run.add(CALIBRATION_QUANTITIES, errors.ok_or_else(degenerate)?);
             }
@@ -394,35 +396,6 @@ fn run(
     }
     run.frame_ns = clock.elapsed().as_nanos() as f64 / drive.frames.len() as f64;
     Ok(run)
-}
-
-/// Readings of the IMU, used up to some time.
-struct ImuTrack<'a> {
-    ahead: &'a [ImuSample],
-    last: Option<ImuSample>,
-}
-
-impl<'a> ImuTrack<'a> {
-    fn new(samples: &'a [ImuSample]) -> Self {
-        Self { ahead: samples, last: samples.first().copied() }
-    }
-
-    /// Moves the belief on to `time`; false if it is past that or there are no readings.
-    fn carry(&mut self, filter: &mut dyn VisualInertialFilter, time: Stamp) -> bool {
-        let Some(mut last) = self.last.filter(|last| last.stamp <= time) else { return false };
-        while let Some((next, ahead)) = self.ahead.split_first() {
-            let reached = next.stamp <= time;
-            let to = if reached { *next } else { ImuSample::between(&last, next, time) };
-            filter.propagate(&last, &to);
-            last = to;
-            if !reached {
-                break;
-            }
-            self.ahead = ahead;
-        }
-        self.last = Some(last);
-        true
-    }
 }
 
 /// In the order of [`CALIBRATION_QUANTITIES`].
@@ -474,91 +447,6 @@ fn errors(belief: &Belief, truth: &BodyState) -> Option<[f64; 6]> {
 /// Of the camera, as the filter has it, or as it is known.
 fn mounting(filter: &dyn VisualInertialFilter, known: &Isometry3<f64>) -> Isometry3<f64> {
     filter.calibration().map_or(*known, |estimate| estimate.body_from_camera)
-}
-
-/// Which landmark is which point of the map; the map lives by the rules of the pipeline.
-struct Tracks {
-    map: Map,
-    points: BTreeMap<usize, u64>,
-}
-
-impl Default for Tracks {
-    fn default() -> Self {
-        Self { map: Map::new(&MapConfig::default()), points: Default::default() }
-    }
-}
-
-impl Tracks {
-    fn see(
-        &mut self,
-        filter: &mut dyn VisualInertialFilter,
-        treatment: MapTreatment,
-        number: u64,
-        frame: &Frame,
-        body_from_camera: &Isometry3<f64>,
-        config: &FilterConfig,
-    ) {
-        let mounted = mounting(filter, body_from_camera);
-        let camera = filter.belief().state.world_from_body * mounted;
-        let sighting = Sighting {
-            frame: number,
-            camera: camera.translation.vector,
-            descriptor: Descriptor::from_bytes(&[0; Descriptor::BYTES]),
-            reference: None,
-        };
-        let (mut again, mut fresh) = (Vec::new(), Vec::new());
-        for (landmark, measurement) in &frame.seen {
-            let known = self.points.get(landmark).filter(|id| self.map.get(**id).is_some());
-            match known {
-                Some(&id) => again.push((id, measurement)),
-                None => fresh.push((*landmark, measurement)),
-            }
-        }
-        let seen_from = |mounted: &Isometry3<f64>| -> Vec<_> {
-            again.iter().map(|(id, m)| SeenPoint { id: *id, ..in_body(m, mounted) }).collect()
-        };
-        let seen = seen_from(&mounted);
-        let pairs: Vec<_> = seen.iter().filter_map(|point| self.pair(point)).collect();
-        let updated = match filter.point_state() {
-            Some(points) => points.measure(&seen).is_some(),
-            None => filter.update(&pairs).is_some(),
-        };
-        let refinement = filter.map_refinement();
-        for (point, pair) in seen.iter().zip(&pairs) {
-            let refined =
-                refinement.posterior(pair).filter(|_| updated && treatment != MapTreatment::Fixed);
-            if let Some(refined) = refined {
-                self.map.relocate(point.id, refined.position, refined.covariance);
-            }
-            self.map.observe(point.id, &sighting);
-        }
-        // What follows is measured by the calibration as it is now.
-        let mounted = mounting(filter, body_from_camera);
-        let mut seen = seen_from(&mounted);
-        for (landmark, measurement) in fresh {
-            let point = in_body(measurement, &mounted);
-            let estimate = filter.insert(treatment, &point.in_body, &point.body_covariance);
-            let id = self.map.insert(estimate.position, estimate.covariance, &sighting);
-            if let Some(id) = id {
-                self.points.insert(landmark, id);
-                seen.push(SeenPoint { id, ..point });
-            }
-        }
-        if let Some(points) = filter.point_state() {
-            renew_state_points(points, &mut self.map, &seen, number, config);
-        }
-        self.map.prune(number);
-    }
-
-    fn pair(&self, point: &SeenPoint) -> Option<PointPair> {
-        let known = self.map.get(point.id)?;
-        Some(PointPair {
-            in_body: point.in_body,
-            body_covariance: point.body_covariance,
-            in_world: known.position,
-            world_covariance: known.covariance,
-        })
-    }
 }
 
 #[cfg(test)]

@@ -7,6 +7,7 @@ mod alignment;
 mod attitude;
 mod gnss;
 mod lab;
+mod landmarks;
 pub mod matrix_fisher;
 mod study;
 mod visual;

@@ -16,17 +16,17 @@ use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+use super::landmarks::{LandmarkRun, Seen};
 use super::study::normalized_square;
 use super::{
     Observation, PaperValue, Report, Request, StepTime, Study, StudyError, Trial, monte_carlo,
 };
-use crate::alignment::PointPair;
 use crate::distribution::matrix_fisher::{MatrixFisher, MatrixFisherError};
 use crate::filter::{
-    FilterConfig, FilterKind, MapEstimate, MapTreatment, PointState, SeenPoint, UpdateMethod,
-    VisualInertialFilter,
+    FilterConfig, FilterKind, MapEstimate, MapTreatment, UpdateMethod, VisualInertialFilter,
 };
 use crate::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator, block};
+use crate::map::MapConfig;
 use crate::simulation::{BodyState, LandmarkFrame, LandmarkScene, LandmarkSceneConfig};
 
 /// Section 5.2 of W22, filters.
@@ -123,6 +123,7 @@ const REFINED: &[Contender] = &[
 /// With map points in the state.
 const CORRELATED: &[Contender] = &[
     contender("mfgs", FilterKind::Mfgs, UpdateMethod::Exact),
+    contender("iekfs", FilterKind::Iekfs, UpdateMethod::Exact),
     contender("mekfs", FilterKind::Mekfs, UpdateMethod::Exact),
 ];
 
@@ -204,11 +205,11 @@ fn trial(drives: &Drives, rng: &mut ChaCha8Rng) -> Result<Trial, MatrixFisherErr
                 state_points,
                 ..FilterConfig::default()
             };
-            let mut filter = match &attitude {
+            let filter = match &attitude {
                 None => kind.start(&config, propagator.clone(), belief),
                 Some(attitude) => kind.start_broad(&config, propagator.clone(), belief, attitude),
             };
-            let errors = drive(filter.as_mut(), kind.map_treatment(), &scene, map.clone());
+            let errors = drive(&contender, filter, &config, &scene, &map);
             errors.record(case, contender, &mut trial);
         }
     }
@@ -315,116 +316,66 @@ impl Mean {
     }
 }
 
+/// The landmarks' errors do not depend on their age, and none is forgotten.
+const EVERLASTING: MapConfig = MapConfig {
+    min_distance: 0.0,
+    max_distance: f64::INFINITY,
+    max_view_angle_deg: 180.0,
+    view_margin: 0.0,
+    max_unseen_frames: u64::MAX,
+    max_points: usize::MAX,
+};
+
+/// Whether a filter of this treatment takes a landmark.
+fn takes(treatment: MapTreatment, landmark: usize) -> bool {
+    treatment != MapTreatment::Correlated || landmark.is_multiple_of(STATE_STRIDE)
+}
+
 fn drive(
-    filter: &mut dyn VisualInertialFilter,
-    treatment: MapTreatment,
+    contender: &Contender,
+    filter: Box<dyn VisualInertialFilter>,
+    config: &FilterConfig,
     scene: &LandmarkScene,
-    mut map: LandmarkMap,
+    map: &LandmarkMap,
 ) -> DriveErrors {
+    let treatment = contender.kind.map_treatment();
+    let max_gap = ImuConfig::default().max_gap;
+    let mut run =
+        LandmarkRun::start(contender.kind, filter, config, &EVERLASTING, &scene.imu, max_gap);
+    for (landmark, known) in map.iter().enumerate().filter(|(l, _)| takes(treatment, *l)) {
+        if let Some(known) = known {
+            run.know(landmark, known);
+        }
+    }
     let mut errors = DriveErrors::default();
     let mut seen = vec![false; map.len()];
     let mut frames = scene.frames.iter().enumerate().peekable();
     let mut clock = Instant::now();
-    errors.add_state(filter.belief(), &scene.truth[0]);
-    if treatment == MapTreatment::Correlated {
-        let others = |(index, _): &(usize, &mut Option<_>)| !index.is_multiple_of(STATE_STRIDE);
-        map.iter_mut().enumerate().filter(others).for_each(|(_, point)| *point = None);
-    }
-    for (sample, interval) in scene.imu.windows(2).enumerate() {
-        filter.propagate(&interval[0], &interval[1]);
-        let truth = &scene.truth[sample + 1];
-        if let Some((number, frame)) = frames.next_if(|(_, frame)| frame.sample == sample + 1) {
-            match filter.point_state() {
-                Some(state) => see_points_of_state(state, scene, frame, &mut map),
-                None => see(filter, treatment, scene, frame, &mut map),
-            }
+    errors.add_state(run.back_end.belief(), &scene.truth[0]);
+    for (sample, reading) in scene.imu.iter().enumerate().skip(1) {
+        run.propagate_to(reading.stamp);
+        let truth = &scene.truth[sample];
+        if let Some((number, frame)) = frames.next_if(|(_, frame)| frame.sample == sample) {
+            run.see(|_| sightings(scene, frame, treatment));
             errors.step.add(clock.elapsed().as_nanos() as f64);
             for sighting in &frame.sightings {
                 seen[sighting.landmark] = true;
             }
-            errors.add_map(scene, &map, &seen);
+            errors.add_map(scene, &run, &seen);
             if 2 * number >= scene.frames.len() {
-                errors.add_nees(filter.belief(), truth);
+                errors.add_nees(run.back_end.belief(), truth);
             }
             clock = Instant::now();
         }
-        errors.add_state(filter.belief(), truth);
+        errors.add_state(run.back_end.belief(), truth);
     }
     errors
 }
 
-/// One frame: the belief is conditioned on the landmarks in the map, then they are refined and
-/// new ones added.
-fn see(
-    filter: &mut dyn VisualInertialFilter,
-    treatment: MapTreatment,
-    scene: &LandmarkScene,
-    frame: &LandmarkFrame,
-    map: &mut LandmarkMap,
-) {
+fn sightings(scene: &LandmarkScene, frame: &LandmarkFrame, treatment: MapTreatment) -> Vec<Seen> {
     let body_covariance = scene.measurement_covariance();
-    let matched = frame.sightings.iter().filter_map(|sighting| {
-        let point = map[sighting.landmark]?;
-        let world_covariance = match treatment {
-            MapTreatment::Fixed => Matrix3::zeros(),
-            MapTreatment::Uncertain | MapTreatment::Correlated => point.covariance,
-        };
-        let pair = PointPair {
-            in_body: sighting.in_body,
-            body_covariance,
-            in_world: point.position,
-            world_covariance,
-        };
-        Some((sighting.landmark, pair))
-    });
-    let (landmarks, pairs): (Vec<usize>, Vec<PointPair>) = matched.unzip();
-    let updated = filter.update(&pairs).is_some();
-    if updated && treatment == MapTreatment::Correlated {
-        // A filter that is to hold its points holds none yet, while its attitude is broad. What was
-        // known of these is in its pose now, and would count twice.
-        landmarks.iter().for_each(|&landmark| map[landmark] = None);
-    }
-    if updated && treatment == MapTreatment::Uncertain {
-        let refinement = filter.map_refinement();
-        let entered = landmarks.into_iter().zip(&pairs).zip(filter.passed());
-        for ((landmark, pair), _) in entered.filter(|(_, passed)| **passed) {
-            if let Some(refined) = refinement.posterior(pair) {
-                map[landmark] = Some(refined);
-            }
-        }
-    }
-    for sighting in &frame.sightings {
-        let point = &mut map[sighting.landmark];
-        if point.is_none() && treatment != MapTreatment::Correlated {
-            *point = Some(filter.insert(treatment, &sighting.in_body, &body_covariance));
-        }
-    }
-}
-
-/// The same for a filter whose state holds the landmarks.
-fn see_points_of_state(
-    state: &mut dyn PointState,
-    scene: &LandmarkScene,
-    frame: &LandmarkFrame,
-    map: &mut LandmarkMap,
-) {
-    let body_covariance = scene.measurement_covariance();
-    let taken = frame.sightings.iter().filter(|s| s.landmark.is_multiple_of(STATE_STRIDE));
-    let seen: Vec<_> = taken
-        .map(|s| SeenPoint { id: s.landmark as u64, in_body: s.in_body, body_covariance })
-        .collect();
-    for point in &seen {
-        if let Some(known) = map[point.id as usize] {
-            state.admit_known(point.id, &known);
-        }
-    }
-    state.measure(&seen);
-    for point in &seen {
-        state.admit(point);
-    }
-    for id in state.ids() {
-        map[id as usize] = state.estimate(id);
-    }
+    let taken = frame.sightings.iter().filter(|s| takes(treatment, s.landmark));
+    taken.map(|s| Seen { landmark: s.landmark, in_body: s.in_body, body_covariance }).collect()
 }
 
 impl DriveErrors {
@@ -435,11 +386,11 @@ impl DriveErrors {
         self.position.add((estimate.translation.vector - exact.translation.vector).norm());
     }
 
-    fn add_map(&mut self, scene: &LandmarkScene, map: &LandmarkMap, seen: &[bool]) {
+    fn add_map(&mut self, scene: &LandmarkScene, run: &LandmarkRun, seen: &[bool]) {
         let mut mean = Mean::default();
-        for ((point, truth), seen) in map.iter().zip(&scene.landmarks).zip(seen) {
-            if let Some(point) = point.filter(|_| *seen) {
-                mean.add((point.position - truth).norm());
+        for (landmark, truth) in scene.landmarks.iter().enumerate().filter(|(l, _)| seen[*l]) {
+            if let Some(position) = run.position(landmark) {
+                mean.add((position - truth).norm());
             }
         }
         if mean.count > 0 {

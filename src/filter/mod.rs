@@ -2,19 +2,21 @@
 //! change them.
 
 pub mod attitude;
-mod bayes;
+mod core;
 pub mod gnss;
+mod linear;
 mod third_moments;
 mod visual;
 
 pub use crate::alignment::MapEstimate;
-pub use bayes::{
+pub use core::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep,
     PositionMeasurement, VectorEstimate, VectorMeasurement,
 };
+pub use linear::{Correction, LinearMeasurement};
 pub use visual::{
-    BodyPoints, Calibration, Candidate, Coordinates, FilterConfig, FilterKind, KnownAttitude,
-    MapRefinement, MapTreatment, Mekf, MfgFilter, MotionSpread, PointState, Rest, Screening,
-    SeenPoint, SlamFilter, UpdateMethod, UpdateOutcome, VisualInertialFilter, calibration_block,
-    choose_points, point_by_pose,
+    AttitudeDensity, BodyPoints, Calibration, Candidate, ErrorState, FilterConfig, FilterKind,
+    FrameChange, Gating, KnownAttitude, MapRefinement, MapTreatment, Mekf, MfgFilter,
+    PointObservation, PointState, PointUpdate, PoseSpread, SlamFilter, UpdateMethod,
+    VisualInertialFilter, ZeroVelocity, calibration_block, choose_points, point_by_pose,
 };

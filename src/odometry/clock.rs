@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-use super::{Note, NoteLevel};
+use super::report::{Note, NoteLevel};
 use crate::sensor::{ImuSample, Stamp};
 
 /// Intervals within these multiples of the usual one are regular.

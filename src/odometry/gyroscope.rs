@@ -2,8 +2,8 @@
 
 use nalgebra::{UnitQuaternion, Vector3};
 
+use super::report::{Note, NoteLevel};
 use super::watch::MAX_RATE;
-use super::{Note, NoteLevel};
 use crate::sensor::{ImuSample, Stamp};
 
 /// Turns smaller than this tell nothing, rad.

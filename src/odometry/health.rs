@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Note, NoteLevel};
+use super::report::{Note, NoteLevel};
 use crate::inertial::{Belief, block};
 use crate::sensor::Stamp;
 

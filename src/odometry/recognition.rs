@@ -2,11 +2,12 @@
 
 use nalgebra::Isometry3;
 
+use super::report::{Note, NoteLevel};
 use super::watch::{MAX_FORCE, MAX_RATE};
-use super::{Note, NoteLevel};
-use crate::filter::{FilterConfig, MotionSpread};
+use crate::filter::{FilterConfig, PoseSpread};
 use crate::inertial::NavState;
 use crate::sensor::Stamp;
+use crate::tracking::InView;
 
 /// A pose of few matches may be off by so much, m and rad.
 const SLACK: (f64, f64) = (0.1, 0.1);
@@ -19,24 +20,12 @@ const MANY_AGREE: usize = 30;
 /// Forces as large last no longer than an impact, s.
 const FRAME: f64 = 0.034;
 
-/// What is seen at a pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct InView {
-    /// Matches that agree on the pose.
-    pub agreeing: usize,
-    /// Points of the filter's state that should be in view, and those of them that are seen.
-    pub expected: usize,
-    pub seen: usize,
-}
-
-impl InView {
-    /// Whether so much is seen that the pose is the right one.
-    pub fn confirms(&self) -> bool {
-        if self.expected >= TELLING {
-            self.seen as f64 >= SHARE_SEEN * self.expected as f64
-        } else {
-            self.agreeing >= MANY_AGREE
-        }
+/// Whether so much is seen that a pose is the right one.
+pub(super) fn confirms(seen: &InView) -> bool {
+    if seen.expected >= TELLING {
+        seen.seen as f64 >= SHARE_SEEN * seen.expected as f64
+    } else {
+        seen.agreeing >= MANY_AGREE
     }
 }
 
@@ -84,8 +73,8 @@ impl Jump {
 
 /// What is unknown of a body that has been carried off, at a pose that matches agree on: far more than
 /// they leave open, so that what they tell is not told twice.
-pub(super) fn spread_of_recognition(config: &FilterConfig) -> MotionSpread {
-    MotionSpread { turn: 0.2, shift: 0.5, velocity: config.moving_velocity_sd }
+pub(super) fn spread_of_recognition(config: &FilterConfig) -> PoseSpread {
+    PoseSpread { turn: 0.2, shift: 0.5, velocity: config.moving_velocity_sd }
 }
 
 #[cfg(test)]
@@ -95,7 +84,8 @@ mod tests {
 
     #[test]
     fn few_points_and_few_of_many_confirm_nothing() {
-        let confirms = |agreeing, expected, seen| InView { agreeing, expected, seen }.confirms();
+        let confirms =
+            |agreeing, expected, seen| super::confirms(&InView { agreeing, expected, seen });
         assert!(confirms(8, 8, 4) && confirms(12, 60, 30) && confirms(30, 7, 0));
         assert!(!confirms(29, 7, 7) && !confirms(100, 60, 29) && !confirms(8, 0, 0));
     }

@@ -3,8 +3,9 @@
 use nalgebra::{Isometry3, Matrix3};
 use serde::Serialize;
 
-use crate::filter::{Calibration, Screening};
+use crate::filter::{Calibration, Gating};
 use crate::inertial::{NavCovariance, NavState};
+use crate::map::{Map, MapPoint};
 use crate::sensor::Stamp;
 use crate::so3::ProperSvd;
 
@@ -115,14 +116,24 @@ pub struct StepReport {
     pub calibration: Option<Calibration>,
     /// Parameter of the attitude's matrix Fisher part (`None` for Gaussian filters).
     pub matrix_fisher: Option<ProperSvd>,
-    /// Mean squared normalised innovation per degree of freedom; about 1 when consistent.
-    pub innovation: Option<f64>,
+    /// Normalised innovation squared (NIS) per degree of freedom; about 1 when consistent.
+    pub nis: Option<f64>,
     /// What the gate found of the inliers.
-    pub screening: Option<Screening>,
+    pub gating: Option<Gating>,
     pub counts: StepCounts,
     pub times: StageTimes,
     pub keypoints: Vec<KeypointView>,
     /// All points of the map; filled only when the pipeline is asked to, since it is a copy.
     pub map: Option<Vec<MapPointView>>,
     pub notes: Vec<Note>,
+}
+
+/// A map in order of insertion, as of a frame.
+pub(super) fn map_views(map: &Map, frame: u64) -> Vec<MapPointView> {
+    let view = |point: &MapPoint| MapPointView {
+        position: [point.position.x as f32, point.position.y as f32, point.position.z as f32],
+        covariance: point.covariance.cast(),
+        age: frame.saturating_sub(point.first_seen).try_into().unwrap_or(u32::MAX),
+    };
+    map.points().iter().map(view).collect()
 }

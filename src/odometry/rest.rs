@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 
 use nalgebra::Vector3;
 
-use super::{Note, NoteLevel};
-use crate::filter::Rest;
+use super::report::{Note, NoteLevel};
+use crate::filter::ZeroVelocity;
 use crate::inertial::{ImuConfig, NavState, StandstillCheck, StandstillConfig};
 use crate::sensor::{ImuSample, Stamp};
 
@@ -82,7 +82,7 @@ impl RestDetector {
         stamp: Stamp,
         state: &NavState,
         mut seen: Sighting,
-    ) -> (Option<Rest>, Option<Note>) {
+    ) -> (Option<ZeroVelocity>, Option<Note>) {
         seen.sort_unstable_by_key(|(id, _)| *id);
         let start = stamp.offset_by(-self.config.window);
         // One sample from before the window shows that it is covered.
@@ -169,7 +169,7 @@ impl RestDetector {
 
     /// Rest over one interval between frames. Each has readings of its own; what the body
     /// trembles in one it takes back in others, so that their errors are no more than independent.
-    fn measurement(&self, from: Stamp, to: Stamp) -> Option<Rest> {
+    fn measurement(&self, from: Stamp, to: Stamp) -> Option<ZeroVelocity> {
         let rates: Vec<_> = self
             .samples
             .iter()
@@ -179,7 +179,7 @@ impl RestDetector {
         let mean = rates.iter().sum::<Vector3<f64>>() / rates.len() as f64;
         let StandstillConfig { velocity_sd, rate_sd, .. } = self.config;
         let rate_sd = rate_sd.hypot(self.imu.gyro_noise / to.seconds_since(from).sqrt());
-        (!rates.is_empty()).then_some(Rest { rate: mean, velocity_sd, rate_sd })
+        (!rates.is_empty()).then_some(ZeroVelocity { rate: mean, velocity_sd, rate_sd })
     }
 }
 
@@ -231,7 +231,7 @@ mod tests {
             &mut self,
             speed: impl Fn(f64) -> f64,
             visible: bool,
-        ) -> (Option<Rest>, Option<String>) {
+        ) -> (Option<ZeroVelocity>, Option<String>) {
             for _ in 0..6 {
                 let before = speed(self.time);
                 self.time += 1.0 / 180.0;

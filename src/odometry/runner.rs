@@ -5,8 +5,10 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 use std::time::Instant;
 
-use super::{FrontEndFrame, Odometry, StepReport};
+use super::pipeline::Odometry;
+use super::report::StepReport;
 use crate::sensor::{Event, ImuSample, RgbdFrame, Stamp};
+use crate::tracking::FrontEndFrame;
 use crate::vision::Extraction;
 
 /// Finds the features of one frame; holds no state that one frame hands to the next.

@@ -1,6 +1,6 @@
 //! Which map points the filter's state holds.
 
-use crate::filter::{Candidate, FilterConfig, PointState, SeenPoint, choose_points};
+use crate::filter::{Candidate, FilterConfig, PointObservation, PointState, choose_points};
 use crate::map::Map;
 
 /// Renews the points of the state at the end of a frame, `seen` being the points of the map that
@@ -9,12 +9,12 @@ use crate::map::Map;
 pub fn renew_state_points(
     points: &mut dyn PointState,
     map: &mut Map,
-    seen: &[SeenPoint],
+    seen: &[PointObservation],
     frame: u64,
     config: &FilterConfig,
 ) {
     let held = points.ids();
-    let tested = |point: &&SeenPoint| {
+    let tested = |point: &&PointObservation| {
         map.get(point.id).is_some_and(|p| p.observations >= config.state_min_observations)
     };
     let fresh = seen.iter().filter(|point| !held.contains(&point.id));
@@ -58,6 +58,6 @@ fn follow(points: &mut dyn PointState, map: &mut Map) {
     }
 }
 
-fn candidate(point: &SeenPoint) -> Candidate {
+fn candidate(point: &PointObservation) -> Candidate {
     Candidate { in_body: point.in_body, body_covariance: point.body_covariance }
 }

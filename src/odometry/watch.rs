@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 
-use super::{Note, NoteLevel};
+use super::report::{Note, NoteLevel};
 use crate::inertial::{ImuConfig, NavState};
 use crate::sensor::{ImuSample, Stamp};
 use crate::vision::Feature;

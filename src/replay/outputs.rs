@@ -151,15 +151,15 @@ pub(super) fn belief_columns() -> Vec<String> {
 fn state_line(report: &StepReport) -> String {
     let s = report.matrix_fisher.map(|svd| svd.s);
     let mut fields = belief_fields(report.stamp, &report.state, &report.covariance, s);
-    let largest = report.screening.map(|screening| screening.largest);
+    let largest = report.gating.map(|gating| gating.largest);
     // Empty where nothing limits the distance.
-    let gate = report.screening.map(|screening| screening.threshold).filter(|t| t.is_finite());
-    fields.extend([report.innovation, largest, gate].map(optional_field));
+    let gate = report.gating.map(|gating| gating.threshold).filter(|t| t.is_finite());
+    fields.extend([report.nis, largest, gate].map(optional_field));
     let c = &report.counts;
     let counts =
         [c.features, c.with_depth, c.candidates, c.matches, c.inliers, c.new_points, c.map_points];
     fields.extend(counts.map(|count| count.to_string()));
-    let rejected = report.screening.map(|screening| screening.rejected);
+    let rejected = report.gating.map(|gating| gating.rejected);
     fields.push(rejected.map(|count| count.to_string()).unwrap_or_default());
     fields.extend(report.times.stages().map(|(_, seconds)| format!("{seconds:.6}")));
     fields.extend(calibration_fields(report.calibration.as_ref()));

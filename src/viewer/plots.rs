@@ -223,8 +223,8 @@ impl PlotLog {
         if let Some(s) = report.matrix_fisher.map(|svd| svd.s) {
             log(&MATRIX_FISHER_S, s.map(signed_log).as_slice());
         }
-        if let Some(innovation) = report.innovation {
-            log(&INNOVATION, &[innovation, 1.0]);
+        if let Some(nis) = report.nis {
+            log(&INNOVATION, &[nis, 1.0]);
         }
         let counts = &report.counts;
         let of_frame = [

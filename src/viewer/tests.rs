@@ -99,8 +99,8 @@ impl Walk {
                 s: Vector3::new(4e5, 3e5, 2e5) / (1.0 + time),
                 v: Rotation3::identity(),
             }),
-            innovation: Some(self.rng.random_range(0.7..1.3)),
-            screening: None,
+            nis: Some(self.rng.random_range(0.7..1.3)),
+            gating: None,
             counts: StepCounts {
                 features: keypoints.len(),
                 with_depth: keypoints.len() - count(KeypointRole::NoDepth),

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::super::bayes::{
+use super::super::core::{
     BayesFilter, Estimate, FilterError, InertialStep, VectorEstimate, VectorMeasurement,
 };
 use super::{AttitudeFilterKind, AttitudePrior, GyroModel};

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Rotation3, U3, Vector3};
 
-use super::super::bayes::{
+use super::super::core::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, InertialStep, VectorEstimate,
     VectorMeasurement,
 };

@@ -10,7 +10,7 @@
 
 use nalgebra::{Const, Matrix3, Rotation3, SMatrix, U3, Vector3};
 
-use super::super::bayes::{FilterError, InertialStep};
+use super::super::core::{FilterError, InertialStep};
 use super::super::third_moments::{ThirdMoments, Vector9};
 use super::GyroModel;
 use super::mean::PolarMean;

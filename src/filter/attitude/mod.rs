@@ -46,7 +46,7 @@ use std::str::FromStr;
 
 use nalgebra::{Matrix3, Rotation3, SymmetricEigen, Vector3};
 
-use super::bayes::{BayesFilter, FilterError, Frame, finite};
+use super::core::{BayesFilter, FilterError, Frame, finite};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::distribution::matrix_fisher_gaussian::Correlation;
 

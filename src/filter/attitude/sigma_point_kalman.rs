@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Matrix3x6, Matrix6, Matrix6x3, Rotation3, SVector, Vector3, Vector6};
 
-use super::super::bayes::{
+use super::super::core::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, Frame, InertialStep, VectorEstimate,
     VectorMeasurement,
 };

@@ -2,7 +2,7 @@
 
 use nalgebra::Rotation3;
 
-use super::super::bayes::{FilterError, VectorMeasurement};
+use super::super::core::{FilterError, VectorMeasurement};
 use crate::so3::project_to_so3;
 
 /// The rotation that maximises the likelihood of unit directions, Wahba's problem by singular

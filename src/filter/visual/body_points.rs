@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, SMatrix, Vector3};
 
-use super::broad::{EUCLIDEAN, POSITION};
+use super::euclidean::{EUCLIDEAN, POSITION};
 use crate::alignment::{MapEstimate, PointQuadratic};
 use crate::distribution::regression::RotationRegression;
 use crate::distribution::rotation_quadratic::RotationMoments;
@@ -96,7 +96,7 @@ impl BodyPoints {
 
 #[cfg(test)]
 mod tests {
-    use super::super::point_by_pose;
+    use super::super::map_points::point_by_pose;
     use super::*;
     use crate::distribution::matrix_fisher::MatrixFisher;
     use crate::inertial::{NavCovariance, NavState};

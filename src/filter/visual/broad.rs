@@ -3,27 +3,21 @@
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, SMatrix, SVector, UnitQuaternion, Vector3};
 
-use super::{BodyPoints, Rest};
+use super::body_points::BodyPoints;
+use super::euclidean::{EUCLIDEAN, FIRST, NavRegression, POSITION};
+use super::zero_velocity::ZeroVelocity;
 use crate::alignment::{PointPair, PoseInformation, RobustKernel};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::distribution::progressive::{ProgressiveConfig, progressive_update};
-use crate::distribution::regression::{JointInformation, RotationRegression};
+use crate::distribution::regression::JointInformation;
 use crate::distribution::rotation_quadratic::{
     RotationMoments, RotationQuadratic, rotated_vector_by_rotation,
 };
 use crate::inertial::{Belief, NavCovariance, NavState, Propagator, block, symmetrize};
 
-/// Euclidean part of the state: (velocity, position, gyro bias, accelerometer bias).
-pub const EUCLIDEAN: usize = 12;
-/// First of the Euclidean components in a belief's covariance.
-pub const FIRST: usize = block::VELOCITY;
-/// First component of the position within the Euclidean part.
-pub const POSITION: usize = block::POSITION - FIRST;
+/// First component of the velocity within the Euclidean part, and of the biases.
 const VELOCITY: usize = block::VELOCITY - FIRST;
 const BIASES: usize = block::GYRO_BIAS - FIRST;
-
-/// Density of the attitude and the Euclidean part.
-pub type NavRegression = RotationRegression<EUCLIDEAN>;
 
 /// A belief with a matrix Fisher attitude, beside its first two moments.
 #[derive(Debug, Clone)]
@@ -239,7 +233,7 @@ impl BroadBelief {
     }
 
     /// Conditions the belief on rest, exactly.
-    pub fn condition_on_rest(&self, rest: &Rest) -> Option<BroadUpdate> {
+    pub fn condition_on_zero_velocity(&self, rest: &ZeroVelocity) -> Option<BroadUpdate> {
         let measured = |mean: Vector3<f64>, sd: f64| JointInformation {
             xx: Matrix3::identity() / sd.powi(2),
             eta_x: mean / sd.powi(2),
@@ -606,13 +600,8 @@ mod tests {
         let mut linear = Belief { state, covariance };
         let mut broad = BroadBelief::of_belief(&linear).unwrap();
         let propagator = Propagator::inertial(&ImuConfig::default());
-        let sample = |k: i64| crate::sensor::ImuSample {
-            stamp: crate::sensor::Stamp::from_nanos(k * 5_000_000),
-            angular_velocity: GYRO,
-            specific_force: ACCEL,
-        };
-        for k in 0..40 {
-            propagator.propagate(&mut linear, &sample(k), &sample(k + 1));
+        for _ in 0..40 {
+            propagator.advance(&mut linear, &GYRO, &ACCEL, 0.005);
             broad.propagate(&propagator, &GYRO, &ACCEL, 0.005).unwrap();
         }
         let found = broad.summary();

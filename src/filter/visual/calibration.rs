@@ -2,8 +2,10 @@
 
 use nalgebra::{Isometry3, Matrix3, SMatrix, UnitQuaternion, Vector3};
 
-use super::FilterConfig;
-use super::regression::CALIBRATION_BLOCKS;
+use super::config::FilterConfig;
+
+/// Blocks of three of a state that a [`Calibration`] takes.
+pub(super) const CALIBRATION_BLOCKS: usize = 3;
 
 /// Where in the covariance of a [`Calibration`] its parts are.
 pub mod calibration_block {

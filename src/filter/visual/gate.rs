@@ -3,7 +3,9 @@
 use nalgebra::{Isometry3, Rotation3, Vector3};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-use super::{BodyPoints, FilterConfig, Screening};
+use super::body_points::BodyPoints;
+use super::config::FilterConfig;
+use super::estimator::Gating;
 use crate::alignment::{PointPair, PoseInformation, RobustKernel, WeightedResidual};
 
 /// Coordinates of a point.
@@ -43,7 +45,7 @@ impl Gate {
         pairs: &[PointPair],
         pose: &Isometry3<f64>,
         predicted: &BodyPoints,
-    ) -> (Screening, PoseInformation) {
+    ) -> (Gating, PoseInformation) {
         let (rotation, position) = (pose.rotation.to_rotation_matrix(), &pose.translation.vector);
         let mut residuals = std::mem::take(&mut self.residuals);
         residuals.clear();
@@ -62,7 +64,7 @@ impl Gate {
             largest = largest.max(exact);
             exact
         };
-        let screening = self.judge(pairs.iter().zip(&residuals).map(distance));
+        let gating = self.judge(pairs.iter().zip(&residuals).map(distance));
         for (passed, residual) in self.passed.iter_mut().zip(&residuals) {
             *passed &= residual.is_some();
         }
@@ -70,11 +72,11 @@ impl Gate {
         let entering = passed.filter_map(|(residual, _)| *residual);
         let information = PoseInformation::sum(entering, position, self.kernel);
         self.residuals = residuals;
-        (screening, information)
+        (gating, information)
     }
 
     /// Says of points at these squared Mahalanobis distances from their predictions which pass.
-    pub fn judge(&mut self, distances: impl Iterator<Item = f64>) -> Screening {
+    pub fn judge(&mut self, distances: impl Iterator<Item = f64>) -> Gating {
         let mut largest: f64 = 0.0;
         self.passed.clear();
         for distance in distances {
@@ -84,14 +86,19 @@ impl Gate {
         let rejected = self.passed.iter().filter(|passed| !**passed).count();
         if 4 * rejected > 3 * self.passed.len() {
             self.passed.fill(true);
-            return Screening { largest, threshold: f64::INFINITY, rejected: 0 };
+            return Gating { largest, threshold: f64::INFINITY, rejected: 0 };
         }
-        Screening { largest, threshold: self.threshold, rejected }
+        Gating { largest, threshold: self.threshold, rejected }
     }
 
     /// For each pair last offered whether it passed.
     pub fn passed(&self) -> &[bool] {
         &self.passed
+    }
+
+    /// Indices of the pairs last offered that did not pass. (An empty list does not allocate.)
+    pub fn refused(&self) -> Vec<usize> {
+        (0..self.passed.len()).filter(|i| !self.passed[*i]).collect()
     }
 
     /// Those of the pairs last offered that passed.
@@ -144,7 +151,7 @@ mod tests {
     }
 
     /// At the origin, where a point is known with a variance of 0.01.
-    fn screen(gate: &mut Gate, pairs: &[PointPair]) -> Screening {
+    fn screen(gate: &mut Gate, pairs: &[PointPair]) -> Gating {
         let mut covariance = NavCovariance::zeros();
         covariance.fixed_view_mut::<3, 3>(6, 6).copy_from(&(Matrix3::identity() * 0.01));
         let predicted = BodyPoints::of_belief(&belief(Isometry3::identity(), covariance));

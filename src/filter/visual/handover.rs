@@ -1,15 +1,19 @@
 //! From a broad attitude to map points in the state.
 
-use nalgebra::UnitQuaternion;
+use nalgebra::{Rotation3, Vector3};
 
-use super::{
-    BodyPoints, Calibration, Coordinates, FilterConfig, MfgFilter, PointState, Rest, SlamFilter,
-    UpdateOutcome, VisualInertialFilter,
-};
+use super::body_points::BodyPoints;
+use super::calibration::Calibration;
+use super::config::FilterConfig;
+use super::estimator::{FrameChange, PointState, PointUpdate, VisualInertialFilter};
+use super::kind::FilterKind;
+use super::mfg::MfgFilter;
+use super::slam::{AttitudeDensity, ErrorState, SlamFilter};
+use super::zero_velocity::ZeroVelocity;
 use crate::alignment::PointPair;
 use crate::distribution::matrix_fisher::MatrixFisher;
+use crate::filter::core::{BayesFilter, Estimate, FilterError, InertialStep};
 use crate::inertial::{Belief, NavCovariance, Propagator};
-use crate::sensor::ImuSample;
 use crate::so3::ProperSvd;
 
 /// `mfgs` where the attitude at the start is too uncertain for a covariance.
@@ -37,7 +41,8 @@ impl HandOver {
         belief: Belief,
         attitude: &MatrixFisher,
     ) -> Self {
-        let broad = MfgFilter::broad(config, propagator.clone(), belief, attitude);
+        let broad =
+            MfgFilter::broad(FilterKind::Mfgs, config, propagator.clone(), belief, attitude);
         Self { config: config.clone(), propagator, stage: Stage::Broad(Box::new(broad)) }
     }
 
@@ -62,8 +67,32 @@ impl HandOver {
             _ => return,
         };
         let propagator = self.propagator.clone();
-        let slam = SlamFilter::new(&self.config, Coordinates::Group, propagator, belief);
+        let error = ErrorState::RightInvariant { density: AttitudeDensity::MatrixFisher };
+        let slam = SlamFilter::new(FilterKind::Mfgs, &self.config, error, propagator, belief);
         self.stage = Stage::Concentrated(Box::new(slam));
+    }
+}
+
+impl BayesFilter for HandOver {
+    fn name(&self) -> &'static str {
+        self.filter().name()
+    }
+
+    fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
+        self.concentrate();
+        self.filter_mut().propagate(step)
+    }
+
+    fn attitude(&self) -> Rotation3<f64> {
+        self.filter().attitude()
+    }
+
+    fn estimate(&self) -> Estimate {
+        self.filter().estimate()
+    }
+
+    fn gyro_bias(&self) -> Option<Vector3<f64>> {
+        self.filter().gyro_bias()
     }
 }
 
@@ -72,35 +101,17 @@ impl VisualInertialFilter for HandOver {
         self.filter().belief()
     }
 
-    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool {
-        self.concentrate();
-        self.filter_mut().propagate(from, to)
-    }
-
     fn set_imu_gap(&mut self, in_gap: bool) {
         self.propagator.set_imu_gap(in_gap);
         self.filter_mut().set_imu_gap(in_gap);
     }
 
-    fn coast(&mut self, seconds: f64) {
-        self.concentrate();
-        self.filter_mut().coast(seconds);
+    fn update_map_points(&mut self, pairs: &[PointPair]) -> Result<PointUpdate, FilterError> {
+        self.filter_mut().update_map_points(pairs)
     }
 
-    fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome> {
-        self.filter_mut().update(pairs)
-    }
-
-    fn rest(&mut self, rest: &Rest) -> bool {
-        self.filter_mut().rest(rest)
-    }
-
-    fn doubt_levelling(&mut self, accel_bias_sd: f64) -> bool {
-        self.filter_mut().doubt_levelling(accel_bias_sd)
-    }
-
-    fn passed(&self) -> &[bool] {
-        self.filter().passed()
+    fn update_zero_velocity(&mut self, rest: &ZeroVelocity) -> Result<FrameChange, FilterError> {
+        self.filter_mut().update_zero_velocity(rest)
     }
 
     fn matrix_fisher(&self) -> Option<ProperSvd> {
@@ -115,15 +126,19 @@ impl VisualInertialFilter for HandOver {
         self.filter().reported_covariance()
     }
 
-    fn take_world_turn(&mut self) -> Option<UnitQuaternion<f64>> {
-        self.filter_mut().take_world_turn()
+    fn knows_vertical(&self) -> bool {
+        self.filter().knows_vertical()
     }
 
-    fn point_state(&mut self) -> Option<&mut dyn PointState> {
-        self.filter_mut().point_state()
+    fn point_state(&self) -> Option<&dyn PointState> {
+        self.filter().point_state()
     }
 
-    fn calibrate(&mut self, prior: &Calibration) -> bool {
+    fn point_state_mut(&mut self) -> Option<&mut dyn PointState> {
+        self.filter_mut().point_state_mut()
+    }
+
+    fn calibrate(&mut self, prior: &Calibration) -> Result<(), FilterError> {
         self.filter_mut().calibrate(prior)
     }
 
@@ -136,9 +151,8 @@ impl VisualInertialFilter for HandOver {
 mod tests {
     use super::*;
     use crate::alignment::MapEstimate;
-    use crate::filter::FilterKind;
     use crate::inertial::{ImuConfig, NavState};
-    use crate::sensor::Stamp;
+    use crate::sensor::{ImuSample, Stamp};
     use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 
     #[test]
@@ -169,17 +183,17 @@ mod tests {
                 }
             })
             .collect();
-        assert!(filter.update(&pairs).is_some());
-        assert_eq!(filter.passed().len(), pairs.len());
+        let update = filter.update_map_points(&pairs).unwrap();
+        assert_eq!((update.points, update.refused.len()), (pairs.len(), 0));
         let sample = |nanos| ImuSample {
             stamp: Stamp::from_nanos(nanos),
             angular_velocity: zero,
             specific_force: truth.rotation.inverse() * Vector3::new(0.0, 0.0, 9.81),
         };
-        assert!(filter.propagate(&sample(0), &sample(5_000_000)));
+        filter.propagate(&InertialStep::between(&sample(0), &sample(5_000_000))).unwrap();
         assert!(filter.belief().state.world_from_body.rotation.angle_to(&truth.rotation) < 0.02);
         let known =
             MapEstimate { position: pairs[0].in_world, covariance: pairs[0].world_covariance };
-        assert!(filter.point_state().is_some_and(|points| points.admit_known(0, &known)));
+        assert!(filter.point_state_mut().is_some_and(|points| points.admit_known(0, &known)));
     }
 }

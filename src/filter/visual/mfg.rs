@@ -2,18 +2,20 @@
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-use super::broad::{
-    BroadBelief, BroadUpdate, EUCLIDEAN, NavRegression, POSITION, assemble, nav_state, of_belief,
-};
+use super::body_points::BodyPoints;
+use super::broad::{BroadBelief, BroadUpdate, assemble, nav_state, of_belief};
+use super::config::{FilterConfig, UpdateMethod};
+use super::estimator::{FrameChange, PointUpdate, VisualInertialFilter};
+use super::euclidean::{EUCLIDEAN, NavRegression, POSITION};
 use super::gate::Gate;
-use super::{
-    BodyPoints, FilterConfig, Rest, UpdateMethod, UpdateOutcome, VisualInertialFilter,
-    normalized_innovation,
-};
+use super::kind::FilterKind;
+use super::map_points::normalized_innovation_squared;
+use super::propagation::{advance, interval_means};
+use super::zero_velocity::ZeroVelocity;
 use crate::alignment::{PointPair, PoseInformation, rotated_vector_by_rotation, vectorize};
 use crate::distribution::matrix_fisher::MatrixFisher;
+use crate::filter::core::{BayesFilter, Estimate, FilterError, InertialStep};
 use crate::inertial::{Belief, Propagator, block};
-use crate::sensor::ImuSample;
 use crate::so3::{ProperSvd, angle_between};
 
 /// Least information about a rotation axis from which on the attitude is carried by its mode and
@@ -36,6 +38,7 @@ const SETTLED: f64 = 1e-3;
 /// mean `E[R]`.
 #[derive(Debug, Clone)]
 pub struct MfgFilter {
+    kind: FilterKind,
     config: FilterConfig,
     propagator: Propagator,
     /// The belief, or its summary while it is broad.
@@ -45,15 +48,22 @@ pub struct MfgFilter {
 }
 
 impl MfgFilter {
-    pub fn new(config: &FilterConfig, propagator: Propagator, belief: Belief) -> Self {
+    pub fn new(
+        kind: FilterKind,
+        config: &FilterConfig,
+        propagator: Propagator,
+        belief: Belief,
+    ) -> Self {
         let gate = Gate::new(config);
-        let mut filter = Self { config: config.clone(), propagator, belief, broad: None, gate };
+        let config = config.clone();
+        let mut filter = Self { kind, config, propagator, belief, broad: None, gate };
         filter.broaden();
         filter
     }
 
     /// Starts from a broad attitude that is independent of the rest of `belief`.
     pub fn broad(
+        kind: FilterKind,
         config: &FilterConfig,
         propagator: Propagator,
         belief: Belief,
@@ -62,7 +72,8 @@ impl MfgFilter {
         let broad = BroadBelief::independent(&belief, attitude);
         let belief = broad.summary();
         let gate = Gate::new(config);
-        Self { config: config.clone(), propagator, belief, broad: Some(Box::new(broad)), gate }
+        let (config, broad) = (config.clone(), Some(Box::new(broad)));
+        Self { kind, config, propagator, belief, broad, gate }
     }
 
     /// Whether the attitude is too uncertain for a covariance.
@@ -78,45 +89,48 @@ impl MfgFilter {
         }
     }
 
-    fn propagate_broad(&mut self, gyro: &Vector3<f64>, accel: &Vector3<f64>, h: f64) -> bool {
-        let Some(broad) = &mut self.broad else { return false };
-        let moved = broad.propagate(&self.propagator, gyro, accel, h).is_some();
-        if moved {
-            self.belief = broad.summary();
-        }
-        moved
-    }
-
-    fn update_broad(&mut self, broad: &BroadBelief, pairs: &[PointPair]) -> Option<usize> {
+    fn update_broad(
+        &mut self,
+        broad: &BroadBelief,
+        pairs: &[PointPair],
+    ) -> Result<usize, FilterError> {
         let pairs = self.gate.accepted(pairs);
-        let update = broad.update(pairs, self.config.kernel(), self.config.relinearizations)?;
+        let update = broad
+            .update(pairs, self.config.kernel(), self.config.relinearizations)
+            .ok_or(NO_POSTERIOR)?;
         let points = update.points;
         self.accept_broad(update)?;
-        Some(points)
+        Ok(points)
     }
 
-    fn accept_broad(&mut self, update: BroadUpdate) -> Option<()> {
+    fn accept_broad(&mut self, update: BroadUpdate) -> Result<(), FilterError> {
         if update.least_information > CONCENTRATED {
-            let belief = concentrate(&update.density, &update.mode, &Vector3::zeros())?;
-            self.belief = Some(belief).filter(Belief::is_finite)?;
+            let belief = concentrate(&update.density, &update.mode, &Vector3::zeros());
+            self.belief = belief.filter(Belief::is_finite).ok_or(NO_POSTERIOR)?;
             self.broad = None;
         } else {
-            let broad = update.into_belief()?;
-            self.belief = Some(broad.summary()).filter(Belief::is_finite)?;
+            let broad = update.into_belief().ok_or(NO_POSTERIOR)?;
+            let summary = Some(broad.summary()).filter(Belief::is_finite);
+            self.belief = summary.ok_or(NO_POSTERIOR)?;
             self.broad = Some(Box::new(broad));
         }
-        Some(())
+        Ok(())
     }
 
-    fn update_by_sigma_points(&mut self, information: &PoseInformation) -> Option<usize> {
+    fn update_by_sigma_points(
+        &mut self,
+        information: &PoseInformation,
+    ) -> Result<usize, FilterError> {
         let prior = match self.broad.as_deref() {
-            Some(broad) => broad.clone(),
-            None => BroadBelief::of_belief(&self.belief)?,
+            Some(broad) => Some(broad.clone()),
+            None => BroadBelief::of_belief(&self.belief),
         };
-        let posterior = prior.update_by_sigma_points(information)?;
-        self.belief = Some(posterior.summary()).filter(Belief::is_finite)?;
+        let posterior = prior.and_then(|prior| prior.update_by_sigma_points(information));
+        let posterior = posterior.ok_or(NO_POSTERIOR)?;
+        let summary = Some(posterior.summary()).filter(Belief::is_finite);
+        self.belief = summary.ok_or(NO_POSTERIOR)?;
         self.broad = (posterior.least_information() <= CONCENTRATED).then(|| Box::new(posterior));
-        Some(information.points)
+        Ok(information.points)
     }
 
     /// `information` is that of the accepted points at the predicted pose.
@@ -148,65 +162,79 @@ impl MfgFilter {
     }
 }
 
+/// What an update refuses that has no mode, or no finite one.
+const NO_POSTERIOR: FilterError = FilterError::NotPositive("posterior information");
+
+impl BayesFilter for MfgFilter {
+    fn name(&self) -> &'static str {
+        self.kind.name()
+    }
+
+    fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
+        match &mut self.broad {
+            None => drop(advance(&self.propagator, &mut self.belief, step)?),
+            Some(broad) => {
+                let (gyro, accel) = interval_means(&self.propagator, step)?;
+                broad
+                    .propagate(&self.propagator, &gyro, &accel, step.seconds)
+                    .ok_or(FilterError::NotFinite("propagated belief"))?;
+                self.belief = broad.summary();
+                return Ok(());
+            }
+        }
+        self.broaden();
+        Ok(())
+    }
+
+    fn attitude(&self) -> Rotation3<f64> {
+        self.belief.state.world_from_body.rotation.to_rotation_matrix()
+    }
+
+    fn estimate(&self) -> Estimate {
+        Estimate::of_belief(&self.belief, self.matrix_fisher().map(|svd| svd.s))
+    }
+
+    fn gyro_bias(&self) -> Option<Vector3<f64>> {
+        Some(self.belief.state.gyro_bias)
+    }
+}
+
 impl VisualInertialFilter for MfgFilter {
     fn belief(&self) -> &Belief {
         &self.belief
-    }
-
-    fn propagate(&mut self, from: &ImuSample, to: &ImuSample) -> bool {
-        if self.broad.is_some() {
-            let h = to.stamp.seconds_since(from.stamp);
-            let gyro = (from.angular_velocity + to.angular_velocity) * 0.5;
-            let accel = (from.specific_force + to.specific_force) * 0.5;
-            return h <= 0.0 || self.propagate_broad(&gyro, &accel, h);
-        }
-        let moved = self.propagator.propagate(&mut self.belief, from, to);
-        self.broaden();
-        moved
     }
 
     fn set_imu_gap(&mut self, in_gap: bool) {
         self.propagator.set_imu_gap(in_gap);
     }
 
-    fn coast(&mut self, seconds: f64) {
-        if self.broad.is_some() {
-            if seconds > 0.0 {
-                self.propagate_broad(&Vector3::zeros(), &Vector3::zeros(), seconds);
-            }
-            return;
-        }
-        self.propagator.coast(&mut self.belief, seconds);
-        self.broaden();
-    }
-
-    fn update(&mut self, pairs: &[PointPair]) -> Option<UpdateOutcome> {
+    fn update_map_points(&mut self, pairs: &[PointPair]) -> Result<PointUpdate, FilterError> {
         let pose = &self.belief.state.world_from_body;
-        let (screening, information) = self.gate.screen(pairs, pose, &self.body_points());
+        let (gating, information) = self.gate.screen(pairs, pose, &self.body_points());
         if information.points == 0 {
-            return None;
+            return Err(FilterError::NoMeasurement);
         }
-        let innovation = normalized_innovation(&information, &self.belief)?;
+        let nis = normalized_innovation_squared(&information, &self.belief)?;
         let points = match (self.config.update_method, self.broad.clone()) {
             (UpdateMethod::SigmaPoints, _) => self.update_by_sigma_points(&information)?,
             (UpdateMethod::Exact, Some(broad)) => self.update_broad(&broad, pairs)?,
-            (UpdateMethod::Exact, None) => self.update_concentrated(information, pairs)?,
+            (UpdateMethod::Exact, None) => {
+                self.update_concentrated(information, pairs).ok_or(NO_POSTERIOR)?
+            }
         };
-        Some(UpdateOutcome { innovation, points, screening })
+        let refused = self.gate.refused();
+        Ok(PointUpdate { nis, points, gating, refused, frame: FrameChange::default() })
     }
 
-    fn rest(&mut self, rest: &Rest) -> bool {
+    fn update_zero_velocity(&mut self, rest: &ZeroVelocity) -> Result<FrameChange, FilterError> {
         match &self.broad {
             Some(broad) => {
-                let update = broad.condition_on_rest(rest);
-                update.and_then(|update| self.accept_broad(update)).is_some()
+                let update = broad.condition_on_zero_velocity(rest).ok_or(NO_POSTERIOR)?;
+                self.accept_broad(update)?;
             }
-            None => rest.condition(&mut self.belief),
+            None => rest.condition(&mut self.belief)?,
         }
-    }
-
-    fn passed(&self) -> &[bool] {
-        self.gate.passed()
+        Ok(FrameChange::default())
     }
 
     fn matrix_fisher(&self) -> Option<ProperSvd> {
@@ -332,10 +360,11 @@ mod tests {
         let pairs = pairs(&mut rng, &prior.state, 1e-4, 30);
         let config = FilterConfig { huber: 0.0, ..FilterConfig::default() };
         let propagator = Propagator::constant_velocity(1.0, 1.0);
-        let mut mfg = MfgFilter::new(&config, propagator.clone(), prior);
-        let mut mekf = super::super::Mekf::new(&config, propagator, prior);
-        let (a, b) = (mfg.update(&pairs).unwrap(), mekf.update(&pairs).unwrap());
-        assert_relative_eq!(a.innovation, b.innovation, max_relative = 1e-9);
+        let mut mfg = MfgFilter::new(FilterKind::Mfgr, &config, propagator.clone(), prior);
+        let mut mekf = super::super::Mekf::new(FilterKind::Mekfr, &config, propagator, prior);
+        let (a, b) =
+            (mfg.update_map_points(&pairs).unwrap(), mekf.update_map_points(&pairs).unwrap());
+        assert_relative_eq!(a.nis, b.nis, max_relative = 1e-9);
         let (a, b) = (mfg.belief(), mekf.belief());
         let apart = a.state.world_from_body.rotation.angle_to(&b.state.world_from_body.rotation);
         assert!(apart < 1e-8, "{apart}");
@@ -367,8 +396,8 @@ mod tests {
         let update = |update_method| {
             let config = FilterConfig { huber: 0.0, update_method, ..FilterConfig::default() };
             let propagator = Propagator::constant_velocity(1.0, 1.0);
-            let mut filter = MfgFilter::new(&config, propagator, prior);
-            filter.update(&pairs).unwrap();
+            let mut filter = MfgFilter::new(FilterKind::Mfgr, &config, propagator, prior);
+            filter.update_map_points(&pairs).unwrap();
             *filter.belief()
         };
         let (exact, points) = (update(UpdateMethod::Exact), update(UpdateMethod::SigmaPoints));
@@ -396,12 +425,13 @@ mod tests {
         let all = pairs(&mut rng, &prior.state, 0.01, 3);
         for count in 0..=3 {
             let mut filter = MfgFilter::new(
+                FilterKind::Mfgr,
                 &FilterConfig::default(),
                 Propagator::constant_velocity(1.0, 1.0),
                 prior,
             );
-            let outcome = filter.update(&all[..count]);
-            assert_eq!(outcome.is_some(), count > 0);
+            let outcome = filter.update_map_points(&all[..count]);
+            assert_eq!(outcome.is_ok(), count > 0);
             assert!(filter.belief().is_finite());
             assert!(filter.belief().covariance.cholesky().is_some());
         }

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3};
 
-use super::point_by_pose;
+use super::map_points::point_by_pose;
 
 /// A point in view, as far as its worth goes.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -6,48 +6,15 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Matrix2, Matrix3, Point2, Point3, Vector2, Vector3};
 
 use super::shutter::Shutter;
-use super::{FrontEndFrame, OdometryConfig};
-use crate::alignment::PointPair;
-use crate::filter::SeenPoint;
+use super::view::{FrontEndFrame, View};
 use crate::map::{MapPoint, ReferenceView};
 use crate::sensor::PinholeCamera;
 use crate::vision::ransac::{Consensus, Reprojection};
 use crate::vision::{Correspondence, DepthReading, Feature, PointMeasurement};
 
-/// What the stages of a frame need to know besides the belief and the map.
-pub(super) struct View<'a> {
-    pub config: &'a OdometryConfig,
-    pub camera: &'a PinholeCamera,
-    pub body_from_camera: &'a Isometry3<f64>,
-    pub size: (usize, usize),
-    pub shutter: Shutter,
-    pub seed: u64,
-    /// Whether vision was lost before this frame.
-    pub lost: bool,
-}
-
-impl View<'_> {
-    /// Row of the image that shows what is at an undistorted `pixel`.
-    pub fn row(&self, pixel: Point2<f64>) -> f64 {
-        self.config.camera.distort(pixel).y.clamp(0.0, self.size.1 as f64)
-    }
-
-    /// Undistorted pixel at which a point is seen that is at `in_camera` (m) at the stamp.
-    pub fn project(&self, in_camera: &Vector3<f64>) -> Option<Point2<f64>> {
-        let pixel = self.camera.project(in_camera)?;
-        self.camera.project(&self.shutter.at_row(in_camera, self.row(pixel)))
-    }
-
-    /// A measurement of what is seen at `pixel`, moved to where that is at the stamp.
-    pub fn at_stamp(&self, pixel: Point2<f64>, measured: PointMeasurement) -> PointMeasurement {
-        let point = self.shutter.at_stamp(&measured.point, self.row(pixel));
-        PointMeasurement { point, ..measured }
-    }
-}
-
 /// A feature and the map point that it looks like.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Association {
+pub struct Association {
     /// Index into the features of the frame.
     pub feature: usize,
     /// Id in the map.
@@ -83,7 +50,7 @@ impl Association {
 }
 
 /// A matched feature as a measurement of its map point.
-pub(super) struct Placed {
+pub struct Placed {
     pub measurement: PointMeasurement,
     pub renews_reference: bool,
 }
@@ -92,7 +59,7 @@ pub(super) struct Placed {
 ///
 /// Without depth the feature measures a direction: a point at the predicted depth, as uncertain
 /// along the ray as it is far. `None` where such features are not wanted.
-pub(super) fn place(
+pub fn place(
     feature: &Feature,
     point: &MapPoint,
     world_from_camera: &Isometry3<f64>,
@@ -144,7 +111,7 @@ fn align(
 /// Looks for `point` where `world_from_camera` has it, whether or not there is a corner: what is
 /// there as a feature, and its association with the point. `None` where something else is seen,
 /// by its looks or its distance.
-pub(super) fn seek(
+pub fn seek(
     point: &MapPoint,
     world_from_camera: &Isometry3<f64>,
     front: &FrontEndFrame,
@@ -201,7 +168,7 @@ fn warp(
 }
 
 /// The view of a feature that becomes a map point.
-pub(super) fn first_reference(
+pub fn first_reference(
     feature: &Feature,
     world_from_camera: &Isometry3<f64>,
 ) -> Option<ReferenceView> {
@@ -211,7 +178,7 @@ pub(super) fn first_reference(
 }
 
 /// The present view of `point`, which is where the belief has it by now.
-pub(super) fn reference(
+pub fn reference(
     feature: &Feature,
     point: &MapPoint,
     world_from_camera: &Isometry3<f64>,
@@ -225,31 +192,18 @@ pub(super) fn reference(
 }
 
 /// A camera measurement in body coordinates, its covariance inflated as configured.
-pub(super) fn in_body(measurement: &PointMeasurement, view: &View) -> (Vector3<f64>, Matrix3<f64>) {
+pub fn in_body(measurement: &PointMeasurement, view: &View) -> (Vector3<f64>, Matrix3<f64>) {
     let rotation = view.body_from_camera.rotation.to_rotation_matrix();
     let covariance = rotation.matrix() * measurement.covariance * rotation.matrix().transpose();
     let point = (view.body_from_camera * Point3::from(measurement.point)).coords;
-    (point, covariance * view.config.filter.measurement_inflation)
-}
-
-pub(super) fn seen_point(id: u64, pair: &PointPair) -> SeenPoint {
-    SeenPoint { id, in_body: pair.in_body, body_covariance: pair.body_covariance }
-}
-
-pub(super) fn point_pair(correspondence: &Correspondence, view: &View) -> PointPair {
-    let (in_body, body_covariance) = in_body(&correspondence.measurement, view);
-    PointPair {
-        in_body,
-        body_covariance,
-        in_world: correspondence.world,
-        world_covariance: correspondence.world_covariance,
-    }
+    (point, covariance * view.config.measurement_inflation)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::map::{Map, MapConfig, Sighting};
+    use crate::odometry::OdometryConfig;
     use crate::sensor::{ColorImage, DepthImage, PixelFormat, RgbdFrame, Stamp};
     use crate::vision::{Descriptor, Extraction, Pyramid};
     use nalgebra::UnitQuaternion;
@@ -295,24 +249,19 @@ mod tests {
     fn points_are_found_without_corners_and_not_where_something_else_is_seen() {
         let config = OdometryConfig::default();
         let camera = PinholeCamera { fx: 300.0, fy: 300.0, cx: 160.0, cy: 120.0 };
+        let (fx, fy, cx, cy) = (300.0, 300.0, 160.0, 120.0);
         let config = OdometryConfig {
-            camera: crate::sensor::CameraConfig {
-                fx: 300.0,
-                fy: 300.0,
-                cx: 160.0,
-                cy: 120.0,
-                ..config.camera
-            },
+            camera: crate::sensor::CameraConfig { fx, fy, cx, cy, ..config.camera },
             ..config
-        };
+        }
+        .tracking();
         let view = View {
             config: &config,
             camera: &camera,
-            body_from_camera: &Isometry3::identity(),
+            body_from_camera: Isometry3::identity(),
             size: SIZE,
             shutter: Shutter::default(),
             seed: 0,
-            lost: false,
         };
         let first = wall(&camera, &Isometry3::identity(), 2.0, texture);
         let glimpse = first.extraction.pyramid.look(Point2::new(140.0, 110.0), 1.0).unwrap();

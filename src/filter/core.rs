@@ -10,6 +10,8 @@ use crate::distribution::matrix_fisher::{MatrixFisher, MatrixFisherError};
 use crate::distribution::matrix_fisher_gaussian::MfgError;
 use crate::distribution::progressive::ProgressiveError;
 use crate::distribution::unscented::UnscentedError;
+use crate::inertial::{Belief, block};
+use crate::sensor::ImuSample;
 use crate::so3::NotFinite;
 
 /// A recursive estimator of the attitude and of whatever vectors it carries beside it.
@@ -90,6 +92,20 @@ impl InertialStep {
     /// An interval of which only the angular velocity is known.
     pub fn turning(angular_velocity: Vector3<f64>, seconds: f64) -> Self {
         Self { seconds, angular_velocity, specific_force: None }
+    }
+
+    /// The interval between two samples, with the averages of both ends.
+    pub fn between(from: &ImuSample, to: &ImuSample) -> Self {
+        Self {
+            seconds: to.stamp.seconds_since(from.stamp),
+            angular_velocity: (from.angular_velocity + to.angular_velocity) * 0.5,
+            specific_force: Some((from.specific_force + to.specific_force) * 0.5),
+        }
+    }
+
+    /// An interval in which nothing was measured, for models of motion that need no IMU.
+    pub fn unmeasured(seconds: f64) -> Self {
+        Self { seconds, angular_velocity: Vector3::zeros(), specific_force: None }
     }
 
     /// Refuses an interval that is not positive, and readings that are not finite.
@@ -272,6 +288,24 @@ impl Estimate {
         }
     }
 
+    /// The belief of a filter of the whole navigation state.
+    pub fn of_belief(belief: &Belief, matrix_fisher_s: Option<Vector3<f64>>) -> Self {
+        let Belief { state, covariance } = belief;
+        let block = |start: usize| covariance.fixed_view::<3, 3>(start, start).into_owned();
+        let part = |mean: Vector3<f64>, start: usize| {
+            Some(VectorEstimate { mean, covariance: block(start) })
+        };
+        Self {
+            world_from_body: state.world_from_body.rotation.to_rotation_matrix(),
+            rotation_covariance: block(block::ROTATION),
+            matrix_fisher_s,
+            gyro_bias: part(state.gyro_bias, block::GYRO_BIAS),
+            velocity: part(state.velocity, block::VELOCITY),
+            position: part(state.world_from_body.translation.vector, block::POSITION),
+            accel_bias: part(state.accel_bias, block::ACCEL_BIAS),
+        }
+    }
+
     /// The same for a matrix Fisher belief.
     pub fn of_matrix_fisher(belief: &MatrixFisher) -> Self {
         Self {
@@ -296,6 +330,16 @@ pub enum FilterError {
     NoConvergence(&'static str),
     #[error("a vector of length zero has no direction")]
     ZeroVector,
+    #[error("nothing was measured that can be used")]
+    NoMeasurement,
+    #[error(
+        "{points} points contradict the prediction (NIS {nis:.1} per degree of freedom): too few to be believed"
+    )]
+    FewContradict { points: usize, nis: f64 },
+    #[error("{points} points would turn the body much further than their innovations allow")]
+    TurnsTooFar { points: usize },
+    #[error("the {0} is part of the state already")]
+    AlreadyEstimated(&'static str),
     #[error("this filter needs the specific force")]
     NoSpecificForce,
     #[error("a filter with a gyro bias needs the angular velocity in the body frame")]

@@ -9,14 +9,11 @@
 
 use nalgebra::{DMatrix, Matrix3, SMatrix, UnitQuaternion, Vector3};
 
+use super::UNIFORM_VARIANCE;
 use crate::inertial::{Belief, NavCovariance, attitude_from_gravity, block, symmetrize};
 
 /// Navigation error by gravity.
 type ByGravity = SMatrix<f64, 15, 3>;
-
-/// Variance of each component of the rotation vector of a uniform rotation, rad^2:
-/// `(pi^2 / 3 + 2) / 3`.
-pub(super) const UNIFORM_VARIANCE: f64 = 1.763_289_378_698_817_6;
 
 /// Mean and covariance of gravity (m/s^2) in the world of the filter.
 #[derive(Debug, Clone, PartialEq)]

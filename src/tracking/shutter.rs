@@ -11,7 +11,7 @@ use crate::sensor::CameraConfig;
 /// by `d` is exposed, to first order: the camera turns with `w` and moves with `v`. The default is
 /// without delay.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Shutter {
+pub struct Shutter {
     /// s a row.
     row_time: f64,
     middle_row: f64,
@@ -24,7 +24,7 @@ pub(super) struct Shutter {
 impl Shutter {
     /// Of an image with `rows` rows, taken from a body in `state` with a gyroscope that reads
     /// `measured_rate` (rad/s).
-    pub(super) fn new(
+    pub fn new(
         config: &CameraConfig,
         rows: usize,
         body_from_camera: &Isometry3<f64>,
@@ -43,7 +43,7 @@ impl Shutter {
         }
     }
 
-    pub(super) fn is_rolling(&self) -> bool {
+    pub fn is_rolling(&self) -> bool {
         self.row_time != 0.0
     }
 
@@ -56,12 +56,12 @@ impl Shutter {
     }
 
     /// Where a point is at the stamp that is at `point` (camera coordinates, m) when `row` is exposed.
-    pub(super) fn at_stamp(&self, point: &Vector3<f64>, row: f64) -> Vector3<f64> {
+    pub fn at_stamp(&self, point: &Vector3<f64>, row: f64) -> Vector3<f64> {
         point + self.motion_of(point) * self.delay(row)
     }
 
     /// Where a point is when `row` is exposed that is at `point` (camera coordinates, m) at the stamp.
-    pub(super) fn at_row(&self, point: &Vector3<f64>, row: f64) -> Vector3<f64> {
+    pub fn at_row(&self, point: &Vector3<f64>, row: f64) -> Vector3<f64> {
         point - self.motion_of(point) * self.delay(row)
     }
 }

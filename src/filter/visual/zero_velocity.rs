@@ -1,10 +1,21 @@
-use nalgebra::{Matrix3, Matrix6, SMatrix, Vector3, Vector6};
+//! The zero-velocity update: that the body stands still.
+//!
+//! With the velocity in body coordinates and the gyroscope's mean reading `w` as measurements,
+//!
+//! `0 = R^T v + noise`, `w = b_g + noise`,
+//!
+//! their derivatives by the errors of [`crate::inertial::NavCovariance`] are `(R^T v)^` by the
+//! rotation, `R^T` by the velocity and `I` by the bias.
 
+use nalgebra::{Const, Matrix3, Matrix6, SMatrix, Vector3, Vector6};
+
+use crate::filter::core::FilterError;
+use crate::filter::linear::LinearMeasurement;
 use crate::inertial::{Belief, NavState, block, symmetrize};
 
 /// That the body stands still, as a measurement of its velocity and of the gyro bias.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Rest {
+pub struct ZeroVelocity {
     /// Mean reading of the gyroscope over the interval that the measurement is for, rad/s.
     pub rate: Vector3<f64>,
     /// Standard deviation of each component of the velocity, m/s.
@@ -13,50 +24,47 @@ pub struct Rest {
     pub rate_sd: f64,
 }
 
-impl Rest {
-    /// Residual of (velocity in body coordinates, gyro bias), its derivative by the error of the
-    /// state, and its noise.
+impl ZeroVelocity {
+    /// Linearised at a state whose error's first 15 rows are those of the navigation part.
     ///
     /// In world coordinates a velocity that is not yet estimated to be zero would seem to tell
     /// the heading, which standing still does not.
-    pub(super) fn linearized(
-        &self,
-        state: &NavState,
-    ) -> (Vector6<f64>, SMatrix<f64, 6, 15>, Matrix6<f64>) {
+    pub(super) fn linearized(&self, state: &NavState) -> LinearMeasurement<Const<6>, Const<15>> {
         let body_from_world = state.world_from_body.rotation.inverse();
         let velocity = body_from_world * state.velocity;
         let mut residual = Vector6::zeros();
         residual.fixed_rows_mut::<3>(0).copy_from(&-velocity);
         residual.fixed_rows_mut::<3>(3).copy_from(&(self.rate - state.gyro_bias));
-        let mut by_state = SMatrix::<f64, 6, 15>::zeros();
+        let mut jacobian = SMatrix::<f64, 6, 15>::zeros();
         let mut set = |row: usize, column: usize, value: &Matrix3<f64>| {
-            by_state.fixed_view_mut::<3, 3>(row, column).copy_from(value);
+            jacobian.fixed_view_mut::<3, 3>(row, column).copy_from(value);
         };
         set(0, block::ROTATION, &velocity.cross_matrix());
         set(0, block::VELOCITY, body_from_world.to_rotation_matrix().matrix());
         set(3, block::GYRO_BIAS, &Matrix3::identity());
         let (velocity, rate) = (self.velocity_sd.powi(2), self.rate_sd.powi(2));
         let noise = Vector6::new(velocity, velocity, velocity, rate, rate, rate);
-        (residual, by_state, Matrix6::from_diagonal(&noise))
+        LinearMeasurement { residual, jacobian, first: 0, noise: Matrix6::from_diagonal(&noise) }
     }
 
-    /// The Kalman filter's update, to first order in the rotation. False, and no change, if
-    /// nothing finite follows.
-    pub(super) fn condition(&self, belief: &mut Belief) -> bool {
-        let (residual, by_state, noise) = self.linearized(&belief.state);
-        let by_measurement = belief.covariance * by_state.transpose();
-        let Some(spread) = (by_state * by_measurement + noise).cholesky() else { return false };
-        let gain = spread.solve(&by_measurement.transpose()).transpose();
-        let mut covariance = belief.covariance - gain * by_measurement.transpose();
-        symmetrize(&mut covariance);
-        let state = belief.state.corrected_by(&(gain * residual));
-        let updated = Belief { state, covariance };
-        let finite = updated.is_finite();
-        if finite {
-            *belief = updated;
-        }
-        finite
+    /// Conditions a belief, to first order in the rotation. On an error nothing changes.
+    pub(super) fn condition(&self, belief: &mut Belief) -> Result<(), FilterError> {
+        *belief = corrected(belief, &self.linearized(&belief.state))?;
+        Ok(())
     }
+}
+
+/// A belief conditioned on a measurement of its error.
+pub(super) fn corrected<const M: usize, const K: usize>(
+    belief: &Belief,
+    measurement: &LinearMeasurement<Const<M>, Const<K>>,
+) -> Result<Belief, FilterError> {
+    let correction = measurement.condition(&belief.covariance)?;
+    let mut covariance = belief.covariance;
+    correction.reduce(&mut covariance);
+    symmetrize(&mut covariance);
+    let posterior = Belief { state: belief.state.corrected_by(&correction.change), covariance };
+    posterior.is_finite().then_some(posterior).ok_or(FilterError::NotFinite("posterior"))
 }
 
 #[cfg(test)]
@@ -69,8 +77,8 @@ mod tests {
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
-    const REST: Rest =
-        Rest { rate: Vector3::new(0.02, -0.01, 0.03), velocity_sd: 0.02, rate_sd: 0.004 };
+    const AT_REST: ZeroVelocity =
+        ZeroVelocity { rate: Vector3::new(0.02, -0.01, 0.03), velocity_sd: 0.02, rate_sd: 0.004 };
 
     /// A moving belief with every correlation present.
     fn belief() -> Belief {
@@ -89,14 +97,14 @@ mod tests {
     #[test]
     fn the_derivative_is_that_of_the_residual() {
         let state = belief().state;
-        let (residual, by_state, _) = REST.linearized(&state);
+        let measurement = AT_REST.linearized(&state);
         for k in 0..15 {
             let step = SVector::<f64, 15>::from_fn(|i, _| if i == k { 1e-6 } else { 0.0 });
             // A true state that is off by `step` would have measured this much more.
-            let there = REST.linearized(&state.corrected_by(&step)).0;
+            let there = AT_REST.linearized(&state.corrected_by(&step)).residual;
             assert_relative_eq!(
-                (residual - there) * 1e6,
-                by_state.column(k).into_owned(),
+                (measurement.residual - there) * 1e6,
+                measurement.jacobian.column(k).into_owned(),
                 epsilon = 1e-5
             );
         }
@@ -106,14 +114,14 @@ mod tests {
     fn every_filter_is_the_kalman_filter_in_the_limit() {
         let prior = belief();
         let mut expected = prior;
-        assert!(REST.condition(&mut expected));
+        AT_REST.condition(&mut expected).unwrap();
         assert!(expected.state.velocity.norm() < 0.5 * prior.state.velocity.norm());
-        let error = |belief: &Belief| (belief.state.gyro_bias - REST.rate).norm();
+        let error = |belief: &Belief| (belief.state.gyro_bias - AT_REST.rate).norm();
         assert!(error(&expected) < 0.5 * error(&prior));
         for kind in FilterKind::ALL {
             let propagator = Propagator::inertial(&ImuConfig::default());
             let mut filter = kind.start(&FilterConfig::default(), propagator, prior);
-            assert!(filter.rest(&REST), "{kind}");
+            filter.update_zero_velocity(&AT_REST).unwrap();
             let found = filter.belief();
             assert_relative_eq!(found.covariance, expected.covariance, epsilon = 1e-12);
             assert_relative_eq!(found.state.velocity, expected.state.velocity, epsilon = 1e-12);
@@ -137,7 +145,7 @@ mod tests {
             1.0 / turn.dot(&(information * turn))
         };
         let before = spread(&belief);
-        assert!(REST.condition(&mut belief));
+        AT_REST.condition(&mut belief).unwrap();
         assert_relative_eq!(spread(&belief), before, max_relative = 1e-9);
     }
 }

@@ -5,33 +5,40 @@ use nalgebra::{DMatrix, Dyn, Matrix3, OMatrix, Rotation3, SMatrix, SVector, U3, 
 use crate::distribution::rotation_quadratic::{
     RotationQuadratic, rotated_vector_by_rotation, vectorize,
 };
+use crate::filter::visual::calibration::CALIBRATION_BLOCKS;
 use crate::so3;
 
 /// Blocks of the Euclidean part that are no vectors of the world but of the body.
 const BIASES: std::ops::Range<usize> = 2..4;
 /// The position's block of the Euclidean part.
 const POSITION: usize = 1;
-/// Blocks of the calibration of the camera.
-pub(super) const CALIBRATION_BLOCKS: usize = 3;
 /// Points that are conditioned on at once. Their innovations are decorrelated by substitution,
 /// whose cost grows with the size of the batch; all that follows is matrix products.
 const BATCH: usize = 16;
 /// Columns of the covariance that are updated at once, a multiple of three.
 const PANEL: usize = 96;
 
-/// What the Euclidean part is regressed on.
+/// In what coordinates a filter has its errors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Coordinates {
-    /// On the group of common turns and moves: with `R = exp(t^) R_hat` a world vector is
-    /// `y = exp(t^) y_hat + J(t) (B t + noise)`, `J` the left Jacobian of SO(3), with a matrix
-    /// Fisher density of `R` and the sine of `t` in place of it. A common turn of body and map is
-    /// `t` alone, under which this form keeps its parameters: turning what cannot be observed
-    /// changes nothing that is measured. A vector that does not turn with the body has
-    /// `B t = y_hat x t` and, by `J(t) t^ = exp(t^) - I`, stays exactly where it is.
-    Group,
-    /// On the rotation vector at the estimate, as an extended Kalman filter does:
-    /// `y = y_hat + B e + noise`.
-    Additive,
+pub enum ErrorState {
+    /// The right-invariant error, that of common turns and moves: with `R = exp(t^) R_hat` a world
+    /// vector is `y = exp(t^) y_hat + J(t) (B t + noise)`, `J` the left Jacobian of SO(3). A common
+    /// turn of body and map is `t` alone, under which this form keeps its parameters: turning what
+    /// cannot be observed changes nothing that is measured. A vector that does not turn with the
+    /// body has `B t = y_hat x t` and, by `J(t) t^ = exp(t^) - I`, stays exactly where it is.
+    RightInvariant { density: AttitudeDensity },
+    /// The error on SO(3) x R^n, as an extended Kalman filter has it: the rotation vector `e` at the
+    /// estimate, and `y = y_hat + B e + noise`.
+    So3xRn,
+}
+
+/// What the density of the rotation is where the error is right-invariant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AttitudeDensity {
+    /// Matrix Fisher; the Euclidean part is regressed on the sine of `t`, which is linear in `R`.
+    MatrixFisher,
+    /// Gaussian in `t`, on which the Euclidean part is regressed.
+    Gaussian,
 }
 
 /// A point measured in the body frame.
@@ -60,14 +67,14 @@ pub(super) enum Target {
 ///
 /// `x = x_0(R) + slope y + noise(covariance)`, `-2 log p(R) = -2 log p_0(R) + y^T evidence y`.
 ///
-/// `x_0` is that of [`Coordinates`]. A point measured at `p'` has the residual
+/// `x_0` is that of [`ErrorState`]. A point measured at `p'` has the residual
 /// `R p' + p - l = exp(t^) (q + J(t)^T (u_p - u_l))`, `u = B t + noise`, where `q` is the residual at
 /// the estimate. As its covariance `A` turns with the body, it is weighed with `R` at the estimate
 /// and without the first factor, and `q` says nothing about `R`. (Turning it under a weight that
 /// does not turn would add information about `R` with every anisotropic measurement, whatever is
 /// measured.) What `J(t)` adds is of second order, and taken from an [`Expansion`].
 pub(super) struct Regression<'a> {
-    coordinates: Coordinates,
+    error: ErrorState,
     prior: &'a Rotation3<f64>,
     prior_means: &'a [Vector3<f64>],
     /// First block of the calibration of the camera, which is no vector of the world either.
@@ -108,7 +115,7 @@ impl<'a> Regression<'a> {
     /// the Euclidean part (from `calibration` on, where given, those of the camera's calibration),
     /// and the covariance of both. `None` if the rotation's is not positive definite.
     pub fn of_prior(
-        coordinates: Coordinates,
+        error: ErrorState,
         prior: &'a Rotation3<f64>,
         prior_means: &'a [Vector3<f64>],
         calibration: Option<usize>,
@@ -124,27 +131,26 @@ impl<'a> Regression<'a> {
         conditional.gemm(-1.0, &by_rotation, &cross.transpose(), 1.0);
 
         let mut sum = Self {
-            coordinates,
+            error,
             prior,
             prior_means,
             calibration,
             rotation_information,
             rotation_covariance,
-            slope: DMatrix::zeros(n, coordinates.size()),
+            slope: DMatrix::zeros(n, error.size()),
             covariance: conditional,
-            evidence: DMatrix::zeros(coordinates.size(), coordinates.size()),
+            evidence: DMatrix::zeros(error.size(), error.size()),
         };
         for (k, mean) in prior_means.iter().enumerate().filter(|(k, _)| sum.turns(*k)) {
             let in_body = prior.inverse() * mean;
             let mut rows = by_rotation.fixed_view_mut::<3, 3>(3 * k, 0);
             rows += prior.matrix() * in_body.cross_matrix();
         }
-        match coordinates {
-            Coordinates::Group => {
-                let error = tangent_coordinate(prior.matrix());
-                sum.slope.columns_mut(0, 9).copy_from(&(by_rotation * error));
-            }
-            Coordinates::Additive => sum.slope.columns_mut(0, 3).copy_from(&by_rotation),
+        if error.is_matrix_fisher() {
+            let sine = tangent_coordinate(prior.matrix());
+            sum.slope.columns_mut(0, 9).copy_from(&(by_rotation * sine));
+        } else {
+            sum.slope.columns_mut(0, 3).copy_from(&by_rotation);
         }
         Some(sum)
     }
@@ -154,13 +160,13 @@ impl<'a> Regression<'a> {
         let calibrates = self
             .calibration
             .is_some_and(|first| (first..first + CALIBRATION_BLOCKS).contains(&block));
-        self.coordinates == Coordinates::Group && !BIASES.contains(&block) && !calibrates
+        self.error.is_invariant() && !BIASES.contains(&block) && !calibrates
     }
 
     /// Squared Mahalanobis distance of each measurement from what is expected of it.
     pub fn squared_distances(&self, measurements: &[Measurement]) -> Option<Vec<f64>> {
-        let at_prior = self.coordinates.at_prior();
-        let derivative = self.coordinates.derivative(self.prior);
+        let at_prior = self.error.at_prior();
+        let derivative = self.error.derivative(self.prior);
         let expansion = Expansion::of_prior(self.prior, self.prior_means.len());
         measurements
             .iter()
@@ -178,8 +184,8 @@ impl<'a> Regression<'a> {
         expansion: &Expansion,
         huber: f64,
     ) -> Option<f64> {
-        let at_prior = self.coordinates.at_prior();
-        let derivative = self.coordinates.derivative(self.prior);
+        let at_prior = self.error.at_prior();
+        let derivative = self.error.derivative(self.prior);
         let noises: Vec<_> = measurements
             .iter()
             .map(|m| Some(self.noise(m, expansion, huber, &at_prior, &derivative)?.0))
@@ -205,8 +211,8 @@ impl<'a> Regression<'a> {
         at_prior: &DMatrix<f64>,
         derivative: &DMatrix<f64>,
     ) -> Option<(Matrix3<f64>, f64)> {
-        let turn = match (self.coordinates, measurement.target) {
-            (Coordinates::Group, Target::State { .. }) => self.prior.matrix(),
+        let turn = match measurement.target {
+            Target::State { .. } if self.error.is_invariant() => self.prior.matrix(),
             _ => expansion.mode.matrix(),
         };
         let mut noise = turn * measurement.body_covariance * turn.transpose();
@@ -238,19 +244,23 @@ impl<'a> Regression<'a> {
         };
         let expected = self.prior.inverse() * (target - position);
         let last = rows.ncols() - 1;
-        match self.coordinates {
-            Coordinates::Group => {
-                // A point of the state turns with the body by itself, a known one stays.
-                if let Target::Known { .. } = measurement.target {
-                    let in_body = self.prior.inverse() * target;
-                    for i in 0..3 {
-                        for k in 0..3 {
-                            rows[(i, 3 * k + i)] += in_body[k];
-                        }
+        match (self.error, measurement.target) {
+            // A point of the state turns with the body by itself, a known one stays.
+            (ErrorState::RightInvariant { .. }, Target::State { .. }) => {}
+            (ErrorState::RightInvariant { density: AttitudeDensity::MatrixFisher }, _) => {
+                let in_body = self.prior.inverse() * target;
+                for i in 0..3 {
+                    for k in 0..3 {
+                        rows[(i, 3 * k + i)] += in_body[k];
                     }
                 }
             }
-            Coordinates::Additive => {
+            (ErrorState::RightInvariant { density: AttitudeDensity::Gaussian }, _) => {
+                let in_body = self.prior.inverse() * target;
+                let mut turn = rows.fixed_view_mut::<3, 3>(0, 0);
+                turn -= self.prior.matrix() * in_body.cross_matrix();
+            }
+            (ErrorState::So3xRn, _) => {
                 let mut turn = rows.fixed_view_mut::<3, 3>(0, 0);
                 turn -= self.prior.matrix() * expected.cross_matrix();
             }
@@ -265,13 +275,13 @@ impl<'a> Regression<'a> {
     fn second_order(&self, measurement: &Measurement, expansion: &Expansion) -> Vector3<f64> {
         let turn = so3::log(&(expansion.mode * self.prior.inverse()));
         let position = expansion.moved[POSITION];
-        match (self.coordinates, measurement.target) {
-            (Coordinates::Additive, _) => Vector3::zeros(),
-            (Coordinates::Group, Target::State { block }) => {
+        match (self.error, measurement.target) {
+            (ErrorState::So3xRn, _) => Vector3::zeros(),
+            (ErrorState::RightInvariant { .. }, Target::State { block }) => {
                 let moved = position - expansion.moved[block];
                 so3::right_jacobian(&turn) * moved - moved
             }
-            (Coordinates::Group, Target::Known { .. }) => {
+            (ErrorState::RightInvariant { .. }, Target::Known { .. }) => {
                 so3::left_jacobian(&turn) * position - position
             }
         }
@@ -310,7 +320,7 @@ impl<'a> Regression<'a> {
         let (n, m) = (self.covariance.ncols(), 3 * batch.len());
         // Covariance of x and the innovations, columns of which are contiguous.
         let mut cross = DMatrix::zeros(n, m);
-        let mut design = DMatrix::zeros(m, self.coordinates.size());
+        let mut design = DMatrix::zeros(m, self.error.size());
         let position = self.columns(POSITION);
         for (i, measurement) in batch.iter().enumerate() {
             let mut columns = cross.fixed_columns_mut::<3>(3 * i);
@@ -350,7 +360,7 @@ impl<'a> Regression<'a> {
 
     /// Information about the body-frame rotation error, at the estimate.
     fn information(&self) -> Matrix3<f64> {
-        let derivative = self.coordinates.derivative(self.prior);
+        let derivative = self.error.derivative(self.prior);
         let evidence = derivative.transpose() * &self.evidence * &derivative;
         self.rotation_information + evidence.fixed_view::<3, 3>(0, 0)
     }
@@ -362,20 +372,22 @@ impl<'a> Regression<'a> {
     /// (The derivatives at the mode would mix it with the rest by terms of second order, which
     /// after a few updates is information about the heading.)
     pub fn posterior(self) -> Option<Posterior> {
-        let mode = match self.coordinates {
-            Coordinates::Group => self.rotation_density().mode(self.prior)?.0,
-            Coordinates::Additive => self.additive_mode()?,
+        let mode = if self.error.is_matrix_fisher() {
+            self.rotation_density().mode(self.prior)?.0
+        } else {
+            self.gaussian_mode()?
         };
         // Body coordinates of the mode to those of the estimate, by way of the world where the
         // error is the group's.
-        let error = match self.coordinates {
-            Coordinates::Group => self.prior.inverse() * mode,
-            Coordinates::Additive => Rotation3::identity(),
+        let error = if self.error.is_invariant() {
+            self.prior.inverse() * mode
+        } else {
+            Rotation3::identity()
         };
         let inverse = self.information().cholesky()?.inverse();
         let rotation_covariance = error.matrix().transpose() * inverse * error.matrix();
-        let last = self.coordinates.size() - 1;
-        let slope = &self.slope * self.coordinates.derivative(self.prior);
+        let last = self.error.size() - 1;
+        let slope = &self.slope * self.error.derivative(self.prior);
         let turn = so3::log(&(self.prior.inverse() * mode));
         let displacement = self.slope.column(last) + &slope * turn;
         let left_jacobian = so3::left_jacobian(&(self.prior * turn));
@@ -417,20 +429,27 @@ impl<'a> Regression<'a> {
         RotationQuadratic { linear, quadratic }
     }
 
-    fn additive_mode(&self) -> Option<Rotation3<f64>> {
+    fn gaussian_mode(&self) -> Option<Rotation3<f64>> {
         let gradient = self.evidence.fixed_view::<3, 1>(0, 3);
         let error = -self.information().cholesky()?.solve(&gradient);
         Some(self.prior * Rotation3::new(error))
     }
 }
 
-impl Coordinates {
+impl ErrorState {
+    /// Whether a common turn of body and map is an error of the rotation alone.
+    pub fn is_invariant(self) -> bool {
+        matches!(self, Self::RightInvariant { .. })
+    }
+
+    /// Whether the rotation has a matrix Fisher density.
+    pub fn is_matrix_fisher(self) -> bool {
+        matches!(self, Self::RightInvariant { density: AttitudeDensity::MatrixFisher })
+    }
+
     /// Length of `y`.
     fn size(self) -> usize {
-        match self {
-            Self::Group => 10,
-            Self::Additive => 4,
-        }
+        if self.is_matrix_fisher() { 10 } else { 4 }
     }
 
     /// `y` at the estimate.
@@ -443,11 +462,11 @@ impl Coordinates {
     /// Derivative of `y` by the body-frame rotation error.
     fn derivative(self, rotation: &Rotation3<f64>) -> DMatrix<f64> {
         let mut derivative = DMatrix::zeros(self.size(), 3);
-        match self {
-            Self::Group => derivative
-                .fixed_view_mut::<9, 3>(0, 0)
-                .copy_from(&rotated_vector_by_rotation(rotation.matrix())),
-            Self::Additive => derivative.fill_with_identity(),
+        if self.is_matrix_fisher() {
+            let by_turn = rotated_vector_by_rotation(rotation.matrix());
+            derivative.fixed_view_mut::<9, 3>(0, 0).copy_from(&by_turn);
+        } else {
+            derivative.fill_with_identity();
         }
         derivative
     }

@@ -1,0 +1,45 @@
+use super::health::HealthConfig;
+use super::init::InitConfig;
+use super::truth::TruthConfig;
+use crate::filter::FilterConfig;
+use crate::inertial::{ImuConfig, StandstillConfig};
+use crate::map::MapConfig;
+use crate::sensor::{CameraConfig, PinholeCamera};
+use crate::tracking::{SearchConfig, TrackingConfig};
+use crate::vision::{DepthConfig, MatchingConfig, PatchConfig, RansacConfig};
+use serde::{Deserialize, Serialize};
+
+/// The settings of the pipeline behind the front end.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct OdometryConfig {
+    pub imu: ImuConfig,
+    pub camera: CameraConfig,
+    pub depth: DepthConfig,
+    pub search: SearchConfig,
+    pub matching: MatchingConfig,
+    pub patch: PatchConfig,
+    pub ransac: RansacConfig,
+    pub map: MapConfig,
+    pub filter: FilterConfig,
+    pub init: InitConfig,
+    pub standstill: StandstillConfig,
+    pub truth: TruthConfig,
+    pub health: HealthConfig,
+}
+
+impl OdometryConfig {
+    /// The part that tracking depends on.
+    pub fn tracking(&self) -> TrackingConfig {
+        TrackingConfig {
+            pinhole: PinholeCamera::from(&self.camera),
+            camera: self.camera.clone(),
+            depth: self.depth.clone(),
+            search: self.search.clone(),
+            matching: self.matching.clone(),
+            patch: self.patch.clone(),
+            ransac: self.ransac.clone(),
+            measurement_inflation: self.filter.measurement_inflation,
+            proven_observations: self.filter.state_min_observations,
+        }
+    }
+}
