@@ -1,7 +1,8 @@
 use nalgebra::Isometry3;
 use serde::Serialize;
 
-use super::{EvaluationError, Trajectory, guards};
+use super::guards::{self, MIN_MATCHES};
+use super::{EvaluationError, Trajectory};
 
 /// How a pose finds its counterpart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
@@ -57,9 +58,6 @@ impl PosePairs {
         self.stamps.is_empty()
     }
 }
-
-/// Fewer pairs than this are no trajectory.
-pub(super) const MIN_MATCHES: usize = 3;
 
 /// Pairs poses by time. The default pairs each pose of the trajectory with fewer poses with the
 /// nearest of the other, if that is within the tolerance; the earlier of two that are equally

@@ -5,13 +5,15 @@ use std::fmt;
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
 
 use super::align::PointMoments;
-use super::association::MIN_MATCHES;
 use super::clock::nearby_clock_offset;
 use super::statistics::quantile;
 use super::{
     Alignment, ApeOptions, AssociationOptions, EvaluationError, PosePairs, Relation, Statistics,
     Trajectory, absolute_errors, align,
 };
+
+/// Fewer pairs than this are no trajectory.
+pub(super) const MIN_MATCHES: usize = 3;
 
 /// A sign that the numbers do not mean what they seem to; computed all the same.
 #[derive(Debug, Clone, PartialEq)]

@@ -6,7 +6,8 @@ use nalgebra::{
 use serde::Serialize;
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-use super::association::{MIN_MATCHES, matches};
+use super::association::matches;
+use super::guards::MIN_MATCHES;
 use super::{
     Alignment, AssociationOptions, EvaluationError, PosePairs, Statistics, Trajectory, align,
     guards,

@@ -3,7 +3,7 @@ use std::sync::OnceLock;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Vector3;
 
-use super::MapPoint;
+use super::point::MapPoint;
 
 /// Radius queries over the points of a map, by a k-d tree that is built when it is first asked
 /// after a change.

@@ -1,6 +1,7 @@
 //! One replay from a log to its files and figures: the library behind `replay` and `demo`.
 
 mod attitude;
+mod error;
 mod evaluation;
 mod faults;
 mod metrics;
@@ -24,8 +25,8 @@ pub use outputs::state_columns;
 pub use report::{Series, figures, report};
 
 use crate::config::Config;
-use crate::dataset::{self, Fault, Log, LogError, ReadReport};
-use crate::evaluation::{EvaluationError, Similarity, Trajectory, is_vertical, read_trajectory};
+use crate::dataset::{self, Fault, Log, ReadReport};
+use crate::evaluation::{Similarity, Trajectory, is_vertical, read_trajectory};
 use crate::filter::FilterKind;
 use crate::inertial::pose_covariance;
 use crate::odometry::{FrontEnd, NoteLevel, Observation, Odometry, RunOptions, StepReport, run};
@@ -34,27 +35,7 @@ use evaluation::evaluate;
 use metrics::{peak_memory_bytes, stage_summaries};
 use outputs::Outputs;
 
-#[derive(Debug, thiserror::Error)]
-pub enum ReplayError {
-    #[error(transparent)]
-    Log(#[from] LogError),
-    #[error(transparent)]
-    Evaluation(#[from] EvaluationError),
-    #[error("{path}: {source}")]
-    Write { path: PathBuf, source: std::io::Error },
-    #[error(
-        "`camera.imu_from_camera` is no rigid motion (rotation and translation, row-major 4x4)"
-    )]
-    Extrinsics,
-    #[error("{log}: no attitude: {reason}")]
-    NoAttitude { log: PathBuf, reason: String },
-    #[error("the front end cannot start: {0}")]
-    FrontEnd(String),
-    #[error("the recording failed: {0}")]
-    Recording(String),
-    #[error("{log}: no frame was processed: {reason}")]
-    NothingProcessed { log: PathBuf, reason: String },
-}
+pub use error::ReplayError;
 
 /// What a replay is asked for.
 pub struct Request<'a> {

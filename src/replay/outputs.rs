@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Vector3};
 
-use super::ReplayError;
+use super::error::ReplayError;
 use crate::filter::{Calibration, calibration_block};
 use crate::inertial::{NavCovariance, NavState, block};
 use crate::odometry::{MapPointView, StepReport};

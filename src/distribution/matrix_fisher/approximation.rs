@@ -6,7 +6,7 @@
 use nalgebra::Vector3;
 
 use super::super::circle::CircleMoments;
-use super::engine::Sums;
+use super::sums::Sums;
 use super::{InvalidSingularValues, check_singular_values};
 
 /// An approximate constant and approximate first moments of `M(S)`.

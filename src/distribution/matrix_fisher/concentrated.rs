@@ -11,8 +11,8 @@
 //! leading terms are (2.59) and (2.60); the series is asymptotic, its smallest term
 //! `exp(-2 a1)`.
 
-use super::engine::{EvenMoments, Sums};
 use super::forms::{Basis, CUBICS, MONOMIALS};
+use super::sums::{EvenMoments, Sums};
 
 /// The series serves `s2 + s3` from here on: its smallest term is then below 1e-21.
 pub(super) const MIN_SUM: f64 = 25.0;

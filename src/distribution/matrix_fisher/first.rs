@@ -1,7 +1,7 @@
 use nalgebra::Vector3;
 
-use super::engine::{self, Sums};
-use super::mle::{self, MomentError};
+use super::engine;
+use super::sums::Sums;
 use super::{InvalidSingularValues, check_singular_values};
 
 /// First moments alone, and how they change with the singular values: what a filter needs that
@@ -42,13 +42,6 @@ impl FirstMoments {
     pub fn complement(&self) -> Vector3<f64> {
         let [y1, y2, y3] = self.squares;
         2.0 * Vector3::new(y2 + y3, y1 + y3, y1 + y2)
-    }
-
-    /// `S` with `1 - E[Q_ii] = g_i`, for `g1 <= g2 <= min(g3, 2 - g3)`: as
-    /// [`s_from_complement`](super::s_from_complement) finds it, with the first of Newton's steps
-    /// from here, for which everything is known.
-    pub fn neighbour(&self, g: &Vector3<f64>) -> Result<Vector3<f64>, MomentError> {
-        mle::s_from_complement_at(g, *self)
     }
 }
 

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, SMatrix, Vector3};
 
 use super::MatrixFisher;
-use super::engine::Sums;
+use super::sums::Sums;
 use crate::so3::{hat, quaternion_from_rotation};
 
 impl MatrixFisher {

@@ -8,9 +8,9 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::engine::Sums;
 use super::first::FirstMoments;
 use super::moments::Moments;
+use super::sums::Sums;
 
 /// Steps before giving up; at most 9 were ever needed.
 const MAX_STEPS: usize = 40;
@@ -82,6 +82,15 @@ fn squares_of_complement(g: &Vector3<f64>) -> Result<[f64; 3], MomentError> {
         return Err(MomentError::NotAdmissible(d.into()));
     }
     Ok(squares)
+}
+
+impl FirstMoments {
+    /// `S` with `1 - E[Q_ii] = g_i`, for `g1 <= g2 <= min(g3, 2 - g3)`: as
+    /// [`s_from_complement`](super::s_from_complement) finds it, with the first of Newton's steps
+    /// from here, for which everything is known.
+    pub fn neighbour(&self, g: &Vector3<f64>) -> Result<Vector3<f64>, MomentError> {
+        s_from_complement_at(g, *self)
+    }
 }
 
 impl MomentError {

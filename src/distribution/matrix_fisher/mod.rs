@@ -127,13 +127,14 @@ mod quadrature;
 mod recursion;
 mod sampler;
 mod subset;
+mod sums;
 
 use nalgebra::{Matrix3, Rotation3, SMatrix, Vector3};
 use rand::Rng;
 use rand_distr::Distribution;
 
 use crate::so3::{NotFinite, ProperSvd, principal_axes, proper_svd, quaternion_from_rotation};
-use engine::Sums;
+use sums::Sums;
 
 pub use approximation::{ApproximateMoments, s_concentrated, s_near_uniform};
 pub use axes::canonical_axes;

@@ -1,8 +1,9 @@
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3, Vector4};
 
-use super::engine::{self, Sums};
+use super::engine;
 use super::first::FirstMoments;
 use super::forms::{self, Basis, CUBICS, FORMS};
+use super::sums::Sums;
 use super::{InvalidSingularValues, check_singular_values};
 
 /// Normalizing constant and all moments up to order three of `Q = U^T R V ~ M(S)`, from one pass.

@@ -10,8 +10,8 @@ use std::sync::LazyLock;
 
 use gauss_quad::legendre::GaussLegendre;
 
-use super::engine::{EvenMoments, Sums};
 use super::forms::{Basis, CUBICS, MONOMIALS};
+use super::sums::{EvenMoments, Sums};
 
 /// The series serves `s1 + s2` up to this.
 pub(super) const MAX_SUM: f64 = 1.0 / 64.0;

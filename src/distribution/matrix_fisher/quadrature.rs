@@ -20,8 +20,8 @@ use std::sync::LazyLock;
 use gauss_quad::legendre::GaussLegendre;
 
 use super::super::circle::CircleMoments;
-use super::engine::{EvenMoments, Sums};
 use super::forms::{Basis, CUBICS};
+use super::sums::{EvenMoments, Sums};
 
 /// `exp(-2 a2 u)` is cut off where it falls below `exp(-CUTOFF)`.
 const CUTOFF: f64 = 50.0;

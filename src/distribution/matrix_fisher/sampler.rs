@@ -2,7 +2,7 @@ use nalgebra::{Rotation3, Vector4};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::engine::Sums;
+use super::sums::Sums;
 use crate::so3::{ProperSvd, rotation_from_quaternion};
 
 /// Dimension of the quaternion's space.

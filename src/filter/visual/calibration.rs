@@ -1,4 +1,7 @@
 //! The camera's mounting and clock as part of the state.
+//!
+#![doc = include_str!("../../../docs/theory/calibration.md")]
+#![doc = include_str!("../../../docs/math.html")]
 
 use nalgebra::{Isometry3, Matrix3, SMatrix, UnitQuaternion, Vector3};
 

@@ -1,11 +1,7 @@
 //! The zero-velocity update: that the body stands still.
 //!
-//! With the velocity in body coordinates and the gyroscope's mean reading `w` as measurements,
-//!
-//! `0 = R^T v + noise`, `w = b_g + noise`,
-//!
-//! their derivatives by the errors of [`crate::inertial::NavCovariance`] are `(R^T v)^` by the
-//! rotation, `R^T` by the velocity and `I` by the bias.
+#![doc = include_str!("../../../docs/theory/zero_velocity.md")]
+#![doc = include_str!("../../../docs/math.html")]
 
 use nalgebra::{Const, Matrix3, Matrix6, SMatrix, Vector3, Vector6};
 

@@ -1,4 +1,7 @@
 //! Gravity as part of the state: its direction is opened, found, and leaves the state again.
+//!
+#![doc = include_str!("../../../../docs/theory/gravity.md")]
+#![doc = include_str!("../../../../docs/math.html")]
 
 use nalgebra::{DMatrix, Matrix3, UnitQuaternion, Vector3};
 

@@ -1,4 +1,7 @@
 //! The error state: which rows are whose, the joint covariance, and what may be done to both.
+//!
+#![doc = include_str!("../../../../docs/theory/state.md")]
+#![doc = include_str!("../../../../docs/math.html")]
 
 use std::ops::Range;
 

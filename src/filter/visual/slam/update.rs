@@ -2,6 +2,9 @@
 //!
 //! A point `l` measured at `p'` in the body frame is `0 = R p' + p - l + noise`, with `l` part of the
 //! state or known apart from it. [`Regression`] has the equations.
+//!
+#![doc = include_str!("../../../../docs/theory/points.md")]
+#![doc = include_str!("../../../../docs/math.html")]
 
 use nalgebra::{DMatrix, Point3, UnitQuaternion, Vector3};
 
