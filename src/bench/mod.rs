@@ -28,7 +28,7 @@ mod tables;
 pub use dataset::{Clock, Dataset, Sequence, Source};
 pub use discovery::{Found, find};
 pub use error::BenchError;
-pub use figures::{Figures, NeesMeans, Row, Spread, rows};
+pub use figures::{NeesMeans, Row, Spread, rows};
 pub use guard::{Finding, Guard, StoredRow, findings_table};
 pub use judge::{Estimated, Judged, Judging, coverage, judge};
 pub use key::{RunKey, program_fingerprint};

@@ -8,7 +8,7 @@ use std::time::Instant;
 use cpu_time::ProcessTime;
 use nalgebra::{Isometry3, Matrix3, Matrix6, Vector3};
 
-use super::dataset::{Clock, Source};
+use super::dataset::Source;
 use super::error::BenchError;
 use super::judge::{Estimated, Judging, judge};
 use super::key::{RunKey, input_digest, program_fingerprint};
@@ -88,8 +88,8 @@ pub fn execute(
         };
         records[job.index] = Some(workshop.store.put(&record)?);
         if let (Some(scene), false) = (&job.scene, workshop.keep_logs) {
-            let needed = |other: &Job| other.scene.as_ref().map(SeededScene::digest);
-            if !jobs.iter().any(|other| needed(other) == Some(scene.digest())) {
+            let mut others = jobs.iter().filter_map(|other| other.scene.as_ref());
+            if !others.any(|other| other.digest() == scene.digest()) {
                 remove(&scene.log(workshop.cache));
             }
         }
