@@ -4,9 +4,8 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use mfg_vio::dataset::{LogConfig, open};
-use mfg_vio::inertial::{ImuConfig, ImuSample};
-use mfg_vio::odometry::{Event, TruthPose};
-use mfg_vio::vision::{DepthImage, RgbdFrame};
+use mfg_vio::inertial::ImuConfig;
+use mfg_vio::sensor::{DepthImage, Event, ImuSample, RgbdFrame, TruthPose};
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
 use super::{succeed, text};
