@@ -210,7 +210,13 @@ const VCU_RVI: [Published; 3] = [
 
 #[cfg(test)]
 mod tests {
+    use std::path::{Path, PathBuf};
+
     use super::*;
+    use crate::evaluation::{
+        ApeOptions, AssociationOptions, ape, best_clock_offset, estimate_clock_offset,
+        read_trajectory,
+    };
 
     #[test]
     fn figures_stand_beside_their_sequences() {
@@ -243,5 +249,47 @@ mod tests {
         for (row, printed) in EUROC_MONO.iter().zip([0.069, 0.125, 0.150, 0.202]) {
             assert!((mean(row) - printed).abs() < 7e-4, "{} {}", row.estimator, mean(row));
         }
+    }
+
+    /// The evaluator on the trajectories from which the figures of VCU-RVI come: within 5 mm in the
+    /// lab and 3 % in corridors and halls, besides the last digit that is printed.
+    #[test]
+    fn figures_of_vcu_rvi_are_those_of_the_published_trajectories() {
+        let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+        let data = std::env::var_os("MFG_VIO_DATA").map_or(default, PathBuf::from).join("vcu_rvi");
+        if !data.exists() {
+            eprintln!("SKIPPED: {} is absent (set MFG_VIO_DATA)", data.display());
+            return;
+        }
+        let read = |path: &Path| read_trajectory(path).unwrap().trajectory;
+        let mut compared = 0;
+        for row in &VCU_RVI {
+            for name in Dataset::VcuRvi.sequences() {
+                let folder = data.join("results").join(row.estimator.to_lowercase());
+                let estimate = folder.join(format!("{name}_tum.csv"));
+                let reference = data.join("ground_truths").join(format!("{name}_gt.csv"));
+                let printed = row.figure(Dataset::VcuRvi, name);
+                let (Some(printed), true) = (printed, estimate.exists()) else { continue };
+                let (reference, estimate) = (read(&reference), read(&estimate));
+                let offset = estimate_clock_offset(&reference, &estimate)
+                    .unwrap_or_else(|error| panic!("{} {name}: {error}", row.estimator))
+                    .seconds;
+                let options = ApeOptions::default();
+                let offset = best_clock_offset(&reference, &estimate, offset, &options).unwrap();
+                let association =
+                    AssociationOptions { time_offset: offset, ..options.association };
+                let options = ApeOptions { association, ..options };
+                let error = ape(&reference, &estimate, &options).unwrap().statistics.rmse;
+                let (limit, digit) = match name.starts_with("lab") {
+                    true => (0.005, 0.0005),
+                    false => (0.03 * printed, 0.005),
+                };
+                let difference = (error - printed).abs();
+                let place = format!("{} {name}: {error} at {offset}", row.estimator);
+                assert!(difference <= limit + digit, "{place}, printed {printed}");
+                compared += 1;
+            }
+        }
+        assert!(compared >= 30, "{compared}");
     }
 }

@@ -308,3 +308,73 @@ pub fn camera_section(mount: &Isometry3<f64>, [fx, fy, cx, cy]: [f64; 4]) -> Str
         rows.join(", ")
     )
 }
+
+/// An OpenLORIS-Scene package: gyroscope and accelerometer at two rates, truth of the robot's base
+/// in a planar world of its own.
+pub fn openloris(root: &Path, recording: &Recording, imu_from_camera: &Isometry3<f64>, intrinsics: [f64; 4]) {
+    let world = Isometry3::new(Vector3::new(21.4, 21.1, 0.0), Vector3::z() * -0.6);
+    let base_from_imu = Isometry3::new(Vector3::new(0.23, -0.05, 0.9), Vector3::new(0.1, 1.4, -0.3));
+    let mut lists = [("color", String::new()), ("aligned_depth", String::new())];
+    for frame in &recording.frames {
+        let seconds = frame.stamp.seconds();
+        // Depth has a stamp of its own, microseconds apart.
+        let names = [format!("{seconds:.6}.png"), format!("{:.6}.png", seconds - 7e-6)];
+        save_color(&root.join("color").join(&names[0]), frame);
+        save_depth(&root.join("aligned_depth").join(&names[1]), &frame.depth, 1000.0, 0);
+        for ((folder, list), name) in lists.iter_mut().zip(&names) {
+            *list += &format!("{} {folder}/{name}\n", name.trim_end_matches(".png"));
+        }
+    }
+    for (folder, list) in lists {
+        save(&root.join(format!("{folder}.txt")), list);
+    }
+    let row = |sample: &ImuSample, v: &Vector3<f64>| {
+        format!("{:.8} {} {} {}\n", sample.stamp.seconds(), v.x, v.y, v.z)
+    };
+    let gyroscope = recording.imu.iter().map(|sample| row(sample, &sample.angular_velocity));
+    let accelerometer =
+        recording.imu.iter().step_by(2).map(|sample| row(sample, &sample.specific_force));
+    let tables = [
+        ("d400_gyroscope.txt", "#Time Gx Gy Gz\n", gyroscope.collect::<String>()),
+        ("d400_accelerometer.txt", "#Time Ax Ay Az\n", accelerometer.collect()),
+    ];
+    for (name, header, rows) in tables {
+        save(&root.join(name), format!("{header}{rows}"));
+    }
+    let poses = recording.truth.iter().map(|pose| {
+        tum_line(pose.stamp.seconds(), &(world * pose.world_from_body * base_from_imu.inverse()))
+    });
+    let header = "#Time px py pz qx qy qz qw\n";
+    save(&root.join("groundtruth.txt"), format!("{header}{}", poses.collect::<String>()));
+    let [fx, fy, cx, cy] = intrinsics;
+    let matrix = |rows: usize, cols: usize, data: &[f64]| {
+        let data: Vec<String> = data.iter().map(|x| format!("{x:.16e}")).collect();
+        format!(
+            "!!opencv-matrix\n      rows: {rows}\n      cols: {cols}\n      dt: d\n      data: [ {} ]\n",
+            data.join(", ")
+        )
+    };
+    save(
+        &root.join("sensors.yaml"),
+        format!(
+            "%YAML:1.0\nd400_color_optical_frame:\n   sensor_type: camera\n   fps: 30\n   model: \
+             pinhole\n   intrinsics: {}   distortion_model: radial-tangential\n   \
+             distortion_coefficients: {}",
+            matrix(1, 4, &[fx, cx, fy, cy]),
+            matrix(1, 5, &[0.0; 5])
+        ),
+    );
+    let item = |parent: &str, child: &str, pose: &Isometry3<f64>| {
+        let rows: Vec<f64> = pose.to_homogeneous().transpose().iter().copied().collect();
+        let matrix = matrix(4, 4, &rows);
+        format!("   -\n      parent_frame: {parent}\n      child_frame: {child}\n      matrix: {matrix}")
+    };
+    let color = "d400_color_optical_frame";
+    let imu = imu_from_camera.inverse();
+    let items = [
+        item("base_link", color, &(base_from_imu * imu_from_camera)),
+        item(color, "d400_accelerometer", &imu),
+        item(color, "d400_gyroscope", &imu),
+    ];
+    save(&root.join("trans_matrix.yaml"), format!("%YAML:1.0\ntrans_matrix:\n{}", items.concat()));
+}
