@@ -6,6 +6,8 @@
 //! x to the right and y down; SI units throughout; `measured = true + bias + noise`.
 
 pub mod alignment;
+#[cfg(feature = "vision")]
+pub mod bench;
 pub mod config;
 pub mod dataset;
 pub mod distribution;

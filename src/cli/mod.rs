@@ -1,6 +1,8 @@
 //! The commands: one file each, each a thin shell over the library.
 
 mod attitude;
+#[cfg(feature = "vision")]
+mod bench;
 mod convert;
 #[cfg(feature = "vision")]
 mod demo;
@@ -40,6 +42,8 @@ enum Command {
     Replay(replay::Args),
     #[cfg(feature = "vision")]
     Faults(faults::FaultsArgs),
+    #[cfg(feature = "vision")]
+    Bench(bench::BenchArgs),
     Simulate(simulate::SimulateArgs),
     Attitude(attitude::AttitudeArgs),
     Convert(convert::Args),
@@ -61,6 +65,8 @@ pub fn main() -> ExitCode {
         Command::Replay(args) => replay::run(&args),
         #[cfg(feature = "vision")]
         Command::Faults(args) => faults::run(&args),
+        #[cfg(feature = "vision")]
+        Command::Bench(args) => bench::run(&args),
         Command::Simulate(args) => simulate::run(args),
         Command::Attitude(args) => attitude::run(&args),
         Command::Convert(args) => convert::run(&args),

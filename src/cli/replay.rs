@@ -10,12 +10,12 @@ use mfg_vio::dataset::{self, Fault, LogSummary};
 use mfg_vio::filter::{FilterKind, MapTreatment};
 use mfg_vio::odometry::{InitMode, StepReport};
 use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
+use mfg_vio::sensor::RgbdFrame;
 #[cfg(feature = "viewer")]
-use mfg_vio::sensor::{ImuSample, PinholeCamera, RgbdFrame};
+use mfg_vio::sensor::{ImuSample, PinholeCamera};
 use mfg_vio::viewer::{Contents, Purpose};
 #[cfg(feature = "viewer")]
 use mfg_vio::viewer::{Recorder, Sink};
-#[cfg(feature = "viewer")]
 use mfg_vio::vision::OrbExtractor;
 
 /// Run the estimator over a log of RGB-D frames and IMU samples.

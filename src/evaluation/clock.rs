@@ -1,4 +1,4 @@
-use super::{EvaluationError, Trajectory};
+use super::{ApeOptions, AssociationOptions, EvaluationError, Trajectory, ape, associate};
 
 /// How far the clock of an estimate is from that of the reference.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -22,7 +22,8 @@ const MIN_GAP: f64 = 0.25;
 const GAP_WINDOWS: f64 = 1.25;
 /// Samples of the estimate that are compared.
 const SAMPLES: usize = 4000;
-/// An offset is considered where at least this fraction of the samples meets the reference.
+/// An offset is considered where at least this fraction of the samples that can meet the reference
+/// does: a reference that covers only begin and end of a run cannot meet most of them.
 const MIN_OVERLAP: f64 = 0.3;
 /// Steps of the coarse and the fine search, s.
 const COARSE: f64 = 0.05;
@@ -56,6 +57,47 @@ pub fn estimate_clock_offset(
     })
 }
 
+/// How far positions may move an offset that angular speeds tell, s. Further off they tell of drift.
+const POSITION_WINDOW: f64 = 0.2;
+/// Steps of the search by positions, s.
+const POSITION_COARSE: f64 = 0.02;
+const POSITION_FINE: f64 = 0.0025;
+/// Offsets that lose more than a tenth of the pairs are not considered: fewer pairs err less.
+const MIN_PAIRS: f64 = 0.9;
+
+/// Within 0.2 s of `start` the offset (s, added to the stamps of the estimate) at which the absolute
+/// error is least: the *best constant offset* of published position errors. For errors of attitude
+/// the offset of [`estimate_clock_offset`] is the right one, since it does not know the error.
+///
+/// # Errors
+/// Those of [`ape`] at `start`.
+pub fn best_clock_offset(
+    reference: &Trajectory,
+    estimate: &Trajectory,
+    start: f64,
+    options: &ApeOptions,
+) -> Result<f64, EvaluationError> {
+    let at = |time_offset: f64| ApeOptions {
+        association: AssociationOptions { time_offset, ..options.association },
+        ..*options
+    };
+    let pairs = associate(reference, estimate, &at(start).association)?.len() as f64;
+    let error = |offset: f64| {
+        let result = ape(reference, estimate, &at(offset)).ok()?;
+        (result.pairs.len() as f64 >= MIN_PAIRS * pairs).then_some(result.statistics.rmse)
+    };
+    let least = |middle: f64, window: f64, step: f64| {
+        let count = (window / step).round() as i32;
+        (-count..=count)
+            .map(|k| middle + f64::from(k) * step)
+            .filter_map(|offset| Some((offset, error(offset)?)))
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+            .map_or(middle, |(offset, _)| offset)
+    };
+    let coarse = least(start, POSITION_WINDOW, POSITION_COARSE);
+    Ok(least(coarse, POSITION_COARSE, POSITION_FINE))
+}
+
 /// The best offset within a second of `start`, `None` where the angular speeds tell nothing.
 pub(super) fn nearby_clock_offset(
     reference: &Trajectory,
@@ -76,6 +118,8 @@ struct Signal {
 struct Signals {
     reference: Signal,
     estimate: Signal,
+    /// Fewest samples that must meet.
+    min_samples: f64,
 }
 
 impl Signals {
@@ -84,10 +128,11 @@ impl Signals {
         let slower = interval(reference).max(interval(estimate));
         let window = MIN_WINDOW.max(WINDOW_INTERVALS * slower);
         let stride = estimate.len().div_ceil(SAMPLES);
-        Self {
-            reference: Signal::of(reference, window, 1),
-            estimate: Signal::of(estimate, window, stride),
-        }
+        let reference = Signal::of(reference, window, 1);
+        let estimate = Signal::of(estimate, window, stride);
+        let samples = estimate.stamps.len() as f64;
+        let share = reference.covered() / estimate.covered().max(f64::MIN_POSITIVE);
+        Self { reference, estimate, min_samples: MIN_OVERLAP * samples * share.min(1.0) }
     }
 
     /// The offset between `from` and `to` (s) where the correlation is largest.
@@ -124,7 +169,7 @@ impl Signals {
                 n += 1;
             }
         }
-        if n < 10 || (n as f64) < MIN_OVERLAP * self.estimate.stamps.len() as f64 {
+        if n < 10 || (n as f64) < self.min_samples {
             return None;
         }
         let [e, r, ee, rr, er] = sums.map(|sum| sum / n as f64);
@@ -161,6 +206,12 @@ impl Signal {
             })
             .unzip();
         Self { stamps, speeds, max_interval }
+    }
+
+    /// Time without the gaps, s.
+    fn covered(&self) -> f64 {
+        let intervals = self.stamps.windows(2).map(|pair| pair[1] - pair[0]);
+        intervals.filter(|interval| *interval <= self.max_interval).sum()
     }
 
     /// Linear between samples; stamps asked for with one `cursor` must ascend.
@@ -221,6 +272,32 @@ mod tests {
                 prop_assert!(found.correlation > 0.95);
             }
         }
+    }
+
+    /// A corridor: motion capture at both ends only.
+    #[test]
+    fn a_reference_at_both_ends_is_enough() {
+        let whole = trajectory(100.0, 200.0, 0.0, 0.0);
+        let ends = |stamp: f64| !(25.0..175.0).contains(&stamp);
+        let kept = whole.stamps().iter().zip(whole.poses()).filter(|(stamp, _)| ends(**stamp));
+        let (stamps, poses): (Vec<f64>, Vec<_>) = kept.map(|(s, p)| (*s, *p)).unzip();
+        let reference = Trajectory::new(stamps, poses).unwrap();
+        let estimate = trajectory(10.0, 200.0, 0.17, 0.0);
+        let found = estimate_clock_offset(&reference, &estimate).unwrap();
+        assert!((found.seconds + 0.17).abs() < 5e-3 && found.correlation > 0.9, "{found:?}");
+    }
+
+    #[test]
+    fn positions_move_an_offset_to_the_least_error() {
+        let reference = trajectory(100.0, 30.0, 0.0, 0.0);
+        let estimate = trajectory(20.0, 20.0, -0.1, 5.0);
+        let options = ApeOptions { alignment: crate::evaluation::Alignment::None, ..Default::default() };
+        for start in [0.0, 0.1, 0.25] {
+            let found = best_clock_offset(&reference, &estimate, start, &options).unwrap();
+            assert!((found - 0.1).abs() <= POSITION_FINE, "{found}");
+        }
+        let found = best_clock_offset(&reference, &estimate, 0.5, &options).unwrap();
+        assert!((found - 0.3).abs() < 0.021, "{found}");
     }
 
     #[test]

@@ -28,7 +28,7 @@ mod trajectory_file;
 pub use absolute::{ApeOptions, ApeResult, Relation, absolute_errors, ape, ape_of_pairs};
 pub use align::{Alignment, Similarity, align};
 pub use association::{AssociationOptions, AssociationRule, PosePairs, associate};
-pub use clock::{ClockOffset, estimate_clock_offset};
+pub use clock::{ClockOffset, best_clock_offset, estimate_clock_offset};
 pub use compare::{Comparison, Method, PairedTest, Run, compare};
 pub use error::EvaluationError;
 pub use figures::{

@@ -17,7 +17,7 @@ use std::time::Instant;
 use nalgebra::{Isometry3, Matrix6, UnitQuaternion, Vector3};
 
 pub use attitude::{AttitudeMetrics, AttitudeRequest, Reached, replay_attitude};
-pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors};
+pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors, evaluate};
 pub use faults::{FaultOutcome, Naming, Recovered, fault_grid};
 pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
@@ -31,7 +31,6 @@ use crate::filter::FilterKind;
 use crate::inertial::pose_covariance;
 use crate::odometry::{FrontEnd, NoteLevel, Observation, Odometry, RunOptions, StepReport, run};
 use crate::sensor::{Event, ImuSample, RgbdFrame, Stamp, TruthPose};
-use evaluation::evaluate;
 use metrics::{peak_memory_bytes, stage_summaries};
 use outputs::Outputs;
 
@@ -81,11 +80,19 @@ pub struct Replayed {
     pub evaluated: Option<Evaluated>,
     /// Stamp of the log's first event, s.
     pub first_seconds: f64,
+    /// Stamps of the first and the last frame of the replayed part, s.
+    pub frame_span: Option<[f64; 2]>,
+    reference: Option<Trajectory>,
     estimate: Vec<TruthPose>,
     covariances: Vec<Matrix6<f64>>,
 }
 
 impl Replayed {
+    /// The reference, its clock corrected by `truth.time_offset`; `None` where there is none.
+    pub fn reference(&self) -> Option<&Trajectory> {
+        self.reference.as_ref()
+    }
+
     /// Whether stamps increase, poses are finite and covariances positive definite.
     pub fn is_valid(&self) -> bool {
         let pose = |pose: &TruthPose| {
@@ -138,7 +145,7 @@ pub fn replay(
 
     let (clock, cpu_clock) = (Instant::now(), cpu_time::ProcessTime::now());
     let given = given.map(Iterator::peekable);
-    let mut first = None;
+    let (mut first, mut frame_span) = (None, Span::default());
     let events = EventSource {
         log: log.as_mut(),
         given,
@@ -146,6 +153,8 @@ pub fn replay(
         truth: &mut truth,
         faults,
         first: &mut first,
+        part: [request.start, request.start + request.duration],
+        frames: &mut frame_span,
     };
     let mut span = Span::default();
     run(events, front_end, &mut odometry, options, |observation| match observation {
@@ -167,7 +176,8 @@ pub fn replay(
         return Err(ReplayError::NothingProcessed { log: request.log.clone(), reason });
     };
     let evaluated = reference
-        .map(|reference| evaluate(&reference, &estimate, &session.covariances, summary.has_imu));
+        .as_ref()
+        .map(|reference| evaluate(reference, &estimate, &session.covariances, summary.has_imu));
     let (evaluated, evaluation_failure) = match evaluated.transpose() {
         Ok(evaluated) => (evaluated, None),
         Err(error) => (None, Some(error.to_string())),
@@ -205,6 +215,8 @@ pub fn replay(
         series: session.series,
         evaluated,
         first_seconds: first.unwrap_or_default().seconds(),
+        frame_span: frame_span.0.map(|(first, last)| [first.seconds(), last.seconds()]),
+        reference,
         estimate: session.estimate,
         covariances: session.covariances,
     })
@@ -283,6 +295,10 @@ struct EventSource<'a> {
     faults: &'a [Fault],
     /// Stamp of the first event.
     first: &'a mut Option<Stamp>,
+    /// Start and end of the replayed part, s after the first event.
+    part: [f64; 2],
+    /// Of the frames in that part.
+    frames: &'a mut Span,
 }
 
 impl EventSource<'_> {
@@ -290,6 +306,14 @@ impl EventSource<'_> {
         let replaced = self.given.is_some();
         std::iter::from_fn(|| self.log.next_event())
             .find(|event| !(replaced && matches!(event, Event::Truth(_))))
+    }
+
+    /// Reading may be ahead of what is replayed, so only the part itself counts.
+    fn note_frame(&mut self, stamp: Stamp) {
+        let seconds = self.first.map_or(0.0, |first| stamp.seconds_since(first));
+        if (self.part[0]..=self.part[1]).contains(&seconds) {
+            self.frames.extend(stamp);
+        }
     }
 }
 
@@ -315,8 +339,10 @@ impl Iterator for EventSource<'_> {
             }
             None => event,
         };
-        if let Event::Truth(pose) = &event {
-            self.truth.push(*pose);
+        match &event {
+            Event::Truth(pose) => self.truth.push(*pose),
+            Event::Frame(frame) => self.note_frame(frame.stamp),
+            Event::Imu(_) => {}
         }
         Some(event)
     }

@@ -180,10 +180,16 @@ impl SceneConfig {
 
     /// As [`Self::from_file`], from text; the error is a line for the user.
     pub fn from_toml(text: &str) -> Result<Self, String> {
+        Self::from_layers(&[text])
+    }
+
+    /// As [`Self::from_toml`], from several texts: keys of a later one replace those before.
+    pub fn from_layers(texts: &[&str]) -> Result<Self, String> {
         let line = |e: toml::de::Error| e.to_string().trim().replace('\n', " ");
-        let given: toml::Table = text.parse().map_err(line)?;
         let mut scene = toml::Table::try_from(Self::default()).map_err(|e| e.to_string())?;
-        overlay(&mut scene, given);
+        for text in texts {
+            overlay(&mut scene, text.parse().map_err(line)?);
+        }
         scene.try_into().map_err(line)
     }
 

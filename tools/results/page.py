@@ -142,19 +142,52 @@ def replay(reports):
     return "<h2 id=\"replay\">Replays</h2>" + table(columns, rows)
 
 
+def spread(value, digits=3):
+    """Median [least, largest] over seeds."""
+    if not value:
+        return ""
+    return "{} [{}, {}]".format(*(number(value[k], digits) for k in ("median", "min", "max")))
+
+
+def bench(reports):
+    """One table a data set: each sequence and filter beside published figures."""
+    by_dataset = {}
+    for _, report in reports:
+        by_dataset.setdefault(report["dataset"], []).append(report)
+    parts = []
+    for dataset, found in sorted(by_dataset.items()):
+        sources = {}
+        for report in found:
+            sources |= report.get("sources", {})
+        columns = ["sequence", "filter", "seeds", "failed", "coverage, %", "APE, m",
+                   "attitude, deg", "RPE 1 s, m", "NEES att.", "NEES pos.", "inside 95 %",
+                   "CPU ms/frame", "false alarms", *sources]
+        rows = [[r["sequence"], r["filter"], r["seeds"], r["failures"], 100 * r["coverage"],
+                 spread(r["ape_m"]), spread(r["attitude_deg"]), spread(r["rpe_1s_m"]),
+                 r["nees"]["attitude"], r["nees"]["position"], r["nees"]["inside_95"],
+                 r["cpu_ms_per_frame"], r["false_alarms"],
+                 *(r["published"].get(name) for name in sources)]
+                for report in found for r in report["rows"]]
+        notes = list(dict.fromkeys(note for report in found for note in report.get("notes", [])))
+        notes += [f"{name}: {source}" for name, source in sources.items()]
+        parts += [f"<h3>{html.escape(dataset)}</h3>", table(columns, rows)]
+        parts += [f'<p class="note">{html.escape(note)}</p>' for note in notes]
+    return "<h2 id=\"bench\">Standard data sets</h2>" + "".join(parts)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--absent", nargs="*", default=[], help="data that were not found")
     parser.add_argument("files", nargs="*", type=Path)
     arguments = parser.parse_args()
-    by_kind = {"studies": [], "gnss": [], "broad": [], "replay": []}
+    by_kind = {"studies": [], "gnss": [], "broad": [], "replay": [], "bench": []}
     for file in sorted(arguments.files):
         by_kind[file.parent.name].append((file.stem, json.loads(file.read_text())))
 
     sections = [study(report) for _, report in by_kind["studies"]]
     links = [report["name"] for _, report in by_kind["studies"]]
-    for kind, section in (("gnss", gnss), ("broad", broad), ("replay", replay)):
+    for kind, section in (("bench", bench), ("gnss", gnss), ("broad", broad), ("replay", replay)):
         if by_kind[kind]:
             sections.append(section(by_kind[kind]))
             links.append(kind)
