@@ -11,6 +11,7 @@ pub mod dataset;
 pub mod distribution;
 pub mod evaluation;
 pub mod experiment;
+pub mod fault;
 pub mod filter;
 pub mod inertial;
 pub mod map;
