@@ -219,6 +219,10 @@ impl Monitors {
     /// What the tracks of an image agree on.
     pub fn tracks(&mut self, at: Stamp, matches: usize, inliers: usize, second: usize) {
         let interval = self.frame_interval();
+        // The map may have been made while the IMU was wrong, and contradict itself.
+        if self.gyroscope.newest().is_some() && !self.turns.knows_scale() {
+            return;
+        }
         let tracks = TrackEvidence { matches, inliers, second, interval };
         let verdict = self.scene.observe(at, &tracks);
         self.hear(verdict);

@@ -105,11 +105,9 @@ impl TurnContradiction {
     const MOST: f64 = 60.0;
     /// A scale that calibration leaves open is no fault: twice, or half.
     const LEAST_SCALE: f64 = 2.0;
-    /// The scale is known when the squares of the turns add up to so many times the variance of one (a
-    /// deviation of the scale of 5 %): at rest a bias in other units is only a large bias. Turns that are
-    /// less than so many times the variance may be none.
-    const KNOWN: f64 = 400.0;
-    const TELLING: f64 = 10.0;
+    /// The scale is known when the turns that both agree on, squared, add up to so many times the variance
+    /// of one (a deviation of the scale of 10 %): at rest a bias in other units is only a large bias.
+    const KNOWN: f64 = 100.0;
     /// Change of the bias that is a fault, in deviations of its prior.
     const LEAST_BIAS: f64 = 3.0;
     /// A turn of the body that is one, rad.
@@ -185,8 +183,8 @@ impl TurnContradiction {
 
     fn learn(&mut self, turn: &Turn) {
         let square = turn.residual().norm_squared() / 3.0;
-        let turned = turn.seen.norm_squared();
-        self.agreed += if turned > 3.0 * Self::TELLING * self.variance { turned } else { 0.0 };
+        // Noise of the two is independent.
+        self.agreed += turn.seen.dot(&turn.felt);
         self.count = (self.count + 1.0).min(Self::MEMORY);
         self.variance += (square.min(9.0 * self.variance) - self.variance) / self.count;
         self.variance = self.variance.max((0.05 * Self::USUAL_SD).powi(2));
