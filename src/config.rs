@@ -6,6 +6,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::dataset::{LogConfig, LogSummary};
+use crate::fault::FaultConfig;
 use crate::filter::FilterConfig;
 use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
@@ -37,6 +38,7 @@ pub struct Config {
     pub standstill: StandstillConfig,
     pub truth: TruthConfig,
     pub health: HealthConfig,
+    pub faults: FaultConfig,
     pub recording: RecordingConfig,
 }
 
@@ -142,6 +144,7 @@ impl Config {
             standstill: self.standstill.clone(),
             truth: self.truth.clone(),
             health: self.health.clone(),
+            faults: self.faults.clone(),
         }
     }
 }

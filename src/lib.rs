@@ -13,6 +13,7 @@ pub mod dataset;
 pub mod distribution;
 pub mod evaluation;
 pub mod experiment;
+pub mod fault;
 pub mod filter;
 pub mod inertial;
 pub mod map;

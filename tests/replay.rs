@@ -249,13 +249,17 @@ fn faults_are_named_and_survived() {
     let report = json(&arguments);
     let outcomes = report["outcomes"].as_array().unwrap();
     assert_eq!(outcomes.len(), 1 + faults.len());
-    for (outcome, fault) in outcomes.iter().skip(1).zip(faults) {
+    let names = ["darkness", "imu-gap", "occlusion", "imu-noise"];
+    for ((outcome, fault), name) in outcomes.iter().skip(1).zip(faults).zip(names) {
         assert_eq!(outcome["fault"], fault);
         assert_eq!((&outcome["valid"], &outcome["frames"]), (&true.into(), &91.into()), "{fault}");
-        let delay = outcome["named"]["delay"].as_f64().unwrap_or_else(|| panic!("{fault}"));
+        let named = &outcome["named"];
+        assert_eq!((&named["kind"], &outcome["right"]), (&name.into(), &true.into()), "{fault}");
+        let delay = named["delay"].as_f64().unwrap_or_else(|| panic!("{fault}"));
         assert!((-0.05..0.5).contains(&delay), "{fault}: {delay}");
     }
-    assert_eq!(outcomes[0]["named"], serde_json::Value::Null);
+    // Without a fault none is named in the whole run.
+    assert_eq!(outcomes[0]["all_named"], serde_json::json!([]));
     let wrong = mfg_vio(&["replay", log, "--fault", "blak:1:1"]);
     assert_eq!(wrong.status.code(), Some(2));
     assert!(fail(&["faults", log, "--fault", "black:20:1"]).contains("before `black:20:1` begins"));

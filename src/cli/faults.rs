@@ -9,14 +9,15 @@ use super::terminal::{INTERRUPTED, catch_interrupts};
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Fault};
 use mfg_vio::evaluation::Table;
-use mfg_vio::replay::{FaultOutcome, fault_grid};
+use mfg_vio::replay::{FaultOutcome, confusion, fault_grid};
 
 /// Replay a log under one fault after another and tell what became of the estimate.
 ///
-/// The table says of each fault whether poses and covariances stayed valid, when and how the
-/// event log named it, how long vision was lost, and error and NEES from a second after its end
-/// on (3 is consistent), heading and position of the first poses of run and reference being put on
-/// each other.
+/// The table says of each fault whether it was named as what it is, and when; whether poses and
+/// covariances stayed valid; how long vision was lost; and error and NEES from a second after its
+/// end on (3 is consistent), heading and position of the first poses of run and reference being put
+/// on each other. Without a fault anything that is named is a false alarm. How often each kind was
+/// named what is the confusion matrix below it.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  mfg-vio simulate --out lab.mcap --duration 15\n  \
                         mfg-vio faults lab.mcap --at 5\n  \
@@ -71,8 +72,9 @@ pub fn run(args: &FaultsArgs) -> anyhow::Result<()> {
         true => serde_json::to_string(&serde_json::json!({
             "log": args.log.display().to_string(),
             "outcomes": outcomes,
+            "confusion": confusion(&outcomes),
         }))?,
-        false => table(&outcomes).to_text().trim_end().to_owned(),
+        false => format!("{}\n\n{}", table(&outcomes).to_text().trim_end(), confused(&outcomes)),
     };
     Ok(writeln!(std::io::stdout(), "{output}")?)
 }
@@ -121,10 +123,22 @@ fn folder(out: &Path, fault: Option<&Fault>) -> PathBuf {
     out.join(fault.map_or_else(|| "none".to_owned(), |fault| fault.to_string().replace(':', "_")))
 }
 
+/// How often each kind was named what.
+fn confused(outcomes: &[FaultOutcome]) -> String {
+    let mut table = Table::new(["injected", "named", "runs"]);
+    for (injected, named, runs) in confusion(outcomes) {
+        table.push([injected.to_owned(), named.to_owned(), runs.to_string()]);
+    }
+    let right = outcomes.iter().filter(|outcome| outcome.right == Some(true)).count();
+    let all = outcomes.iter().filter(|outcome| outcome.right.is_some()).count();
+    format!("{}\nnamed as what it is: {right} of {all}", table.to_text().trim_end())
+}
+
 fn table(outcomes: &[FaultOutcome]) -> Table {
     let mut table = Table::new([
         "fault",
         "valid",
+        "right",
         "named after, s",
         "blind, s",
         "diverged",
@@ -143,6 +157,7 @@ fn table(outcomes: &[FaultOutcome]) -> Table {
         table.push([
             outcome.fault.clone().unwrap_or_else(|| "none".to_owned()),
             if outcome.valid { "yes" } else { "NO" }.to_owned(),
+            outcome.right.map_or("-", |right| if right { "yes" } else { "NO" }).to_owned(),
             number(name.map(|name| name.delay), 2),
             format!("{:.2}", outcome.seconds_without_vision),
             outcome.divergences.to_string(),
@@ -153,7 +168,7 @@ fn table(outcomes: &[FaultOutcome]) -> Table {
             outcome
                 .failure
                 .clone()
-                .or_else(|| name.map(|name| name.text.clone()))
+                .or_else(|| name.map(|name| name.fault.to_string()))
                 .unwrap_or_else(|| "-".to_owned()),
         ]);
     }

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use super::pair::{Paired, Pairer};
 use super::{Event, Log, LogConfig, LogSummary, ReadReport, RgbdFrame, TruthPose};
-use crate::sensor::{ColorImage, DepthImage, ImuSample, Stamp};
+use crate::sensor::{ColorImage, DepthImage, ImuSample, Stamp, Stream};
 
 /// One message of a stream that is used, decoded.
 #[derive(Debug, Clone, PartialEq)]
@@ -137,6 +137,7 @@ impl<S: ReadingSource> Log for MergedLog<S> {
                     Event::Imu(_) => &mut self.report.imu_samples,
                     Event::Frame(_) => &mut self.report.frames,
                     Event::Truth(_) => &mut self.report.truth_poses,
+                    Event::Repeated(..) => return Some(event),
                 };
                 *count += 1;
                 return Some(event);
@@ -238,6 +239,7 @@ impl ReorderBuffer {
             report.skip_at(&reason, stamp);
             return;
         }
+        let repeated = self.repeated(&reading);
         let new = match reading {
             Reading::Color(stamp, image) => self.images.add_color(stamp, image),
             Reading::Depth(stamp, image) => self.images.add_depth(stamp, image),
@@ -251,6 +253,9 @@ impl ReorderBuffer {
         if !new {
             let reason = format!("{stream}: repeated stamp");
             report.skip_at(&reason, stamp);
+            if let Some(stream) = repeated {
+                self.add_event(3 + stream as u8, Event::Repeated(stream, stamp));
+            }
             return;
         }
         self.size += size;
@@ -268,6 +273,21 @@ impl ReorderBuffer {
         }
         if self.oldest().is_some_and(|oldest| oldest <= until) {
             self.release(until, report);
+        }
+    }
+
+    /// The stream of a reading that is the same as one that waits already. Another one of the same
+    /// stamp is no repetition: a clock may have gone back.
+    fn repeated(&self, reading: &Reading) -> Option<Stream> {
+        match reading {
+            Reading::Imu(sample) => {
+                let before = self.events.get(&(sample.stamp, 0))?;
+                matches!(before, Event::Imu(before) if before == sample).then_some(Stream::Imu)
+            }
+            Reading::Color(stamp, image) => {
+                (self.images.color(*stamp)? == image).then_some(Stream::Frames)
+            }
+            _ => None,
         }
     }
 
@@ -382,6 +402,7 @@ mod tests {
                 Event::Imu(_) => 'i',
                 Event::Frame(_) => 'f',
                 Event::Truth(_) => 't',
+                Event::Repeated(..) => 'r',
             };
             (kind, event.stamp().nanos() / 1_000_000)
         });
@@ -403,6 +424,22 @@ mod tests {
         let (events, skipped) = merge(readings, 0.5);
         let expected = [('i', 0), ('i', 10), ('t', 10), ('f', 10), ('i', 20), ('f', 40)];
         assert_eq!((events.as_slice(), skipped.len()), (&expected[..], 0));
+    }
+
+    /// The same again is told of; another message of the same stamp is only left out.
+    #[test]
+    fn repetitions_are_told_of() {
+        let other = |millis| match imu(millis) {
+            Reading::Imu(sample) => {
+                Reading::Imu(ImuSample { angular_velocity: Vector3::x(), ..sample })
+            }
+            other => other,
+        };
+        let readings =
+            vec![imu(0), imu(0), imu(10), other(10), color(20, 2), depth(20, 2), color(20, 2)];
+        let (events, skipped) = merge(readings, 0.5);
+        assert_eq!(events, [('i', 0), ('r', 0), ('i', 10), ('f', 20), ('r', 20)]);
+        assert_eq!(skipped["imu: repeated stamp"], 2);
     }
 
     #[test]

@@ -41,6 +41,11 @@ impl<C, D> Pairer<C, D> {
         insert_new(&mut self.depths, stamp, depth)
     }
 
+    /// The color image of this stamp, if it is held.
+    pub fn color(&self, stamp: Stamp) -> Option<&C> {
+        self.colors.get(&stamp)
+    }
+
     /// Stamp of the oldest image held.
     pub fn oldest(&self) -> Option<Stamp> {
         let color = self.colors.keys().next();

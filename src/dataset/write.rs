@@ -196,6 +196,7 @@ impl LogWriter {
             Event::Imu(sample) => self.imu(sample),
             Event::Frame(frame) => self.frame(frame),
             Event::Truth(pose) => self.truth(pose),
+            Event::Repeated(..) => Ok(()),
         }
     }
 

@@ -198,12 +198,12 @@ impl BackEnd {
     }
 
     /// Conditions the belief on rest.
-    pub fn rest(&mut self, rest: &ZeroVelocity) -> Result<(), FilterError> {
+    pub fn rest(&mut self, rest: &ZeroVelocity) -> Result<FrameChange, FilterError> {
         let change = self.filter.update_zero_velocity(rest)?;
         if let Some(turn) = change.world_turn {
             self.map.carry(&Isometry3::from_parts(Translation3::identity(), turn));
         }
-        Ok(())
+        Ok(change)
     }
 
     /// Moves the map as an update changed the world: turned, or with the camera, by which its points

@@ -1,6 +1,7 @@
 use super::health::HealthConfig;
 use super::init::InitConfig;
 use super::truth::TruthConfig;
+use crate::fault::FaultConfig;
 use crate::filter::FilterConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
@@ -25,6 +26,7 @@ pub struct OdometryConfig {
     pub standstill: StandstillConfig,
     pub truth: TruthConfig,
     pub health: HealthConfig,
+    pub faults: FaultConfig,
 }
 
 impl OdometryConfig {

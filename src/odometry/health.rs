@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::report::{Note, NoteLevel};
+use super::report::Note;
+use crate::fault::Divergence;
 use crate::inertial::{Belief, block};
 use crate::sensor::Stamp;
 
@@ -16,17 +17,6 @@ pub enum DivergencePolicy {
     Stop,
     /// Say so and start anew from the IMU, where the estimate was last sound.
     Reinitialize,
-}
-
-/// In what way an estimate has diverged.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Divergence {
-    Speed,
-    /// Belief and map contradict each other.
-    Innovation,
-    Position,
-    /// All of a sudden nothing of the map was in view, though there was enough to see.
-    View,
 }
 
 /// When an estimate is taken to have diverged.
@@ -130,6 +120,11 @@ impl Health {
         self.diverged.is_some() && self.config.on_divergence == DivergencePolicy::Stop
     }
 
+    /// In what way the estimate has diverged, if it has.
+    pub fn divergence(&self) -> Option<Divergence> {
+        self.diverged
+    }
+
     /// In what way the estimate has diverged, if it is to be started anew for that.
     pub fn restarts(&self) -> Option<Divergence> {
         self.diverged.filter(|_| self.config.on_divergence == DivergencePolicy::Reinitialize)
@@ -159,7 +154,7 @@ impl Health {
                     "vision lost at {stamp} s: {features} features, {matches} of them matched, \
                      {inliers} of those agree"
                 );
-                Some(Note { level: NoteLevel::Warning, text })
+                Some(Note::warning(text))
             }
             (true, Some(since)) => {
                 self.lost_since = None;
@@ -167,7 +162,7 @@ impl Health {
                 self.summary.seconds_without_vision += gap;
                 self.summary.longest_without_vision = self.summary.longest_without_vision.max(gap);
                 let text = format!("vision back at {stamp} s, after {gap:.2} s without");
-                Some(Note { level: NoteLevel::Info, text })
+                Some(Note::info(text))
             }
             _ => None,
         }
@@ -182,7 +177,7 @@ impl Health {
             text = format!("diverged at {stamp} s: {text}, though there was enough to see");
             self.summary.divergences.push(text.clone());
         }
-        Note { level: NoteLevel::Warning, text }
+        Note::warning(text)
     }
 
     /// Judges the belief after a frame; `innovation` is the normalised one, if there was any.
@@ -203,12 +198,12 @@ impl Health {
                 self.diverged = Some(divergence);
                 let text = format!("diverged at {stamp} s: {reason}");
                 self.summary.divergences.push(text.clone());
-                Some(Note { level: NoteLevel::Warning, text })
+                Some(Note::warning(text))
             }
             (None, Some(_)) if self.config.on_divergence == DivergencePolicy::Continue => {
                 self.diverged = None;
                 let text = format!("sound again at {stamp} s");
-                Some(Note { level: NoteLevel::Info, text })
+                Some(Note::info(text))
             }
             _ => None,
         }

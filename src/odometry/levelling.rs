@@ -1,6 +1,6 @@
 //! Whether the world's vertical is known, and whether what levelled it is still to be believed.
 
-use super::report::{Note, NoteLevel};
+use super::report::Note;
 use super::restart::BIAS_FACTOR;
 use crate::filter::VisualInertialFilter;
 use crate::inertial::{Belief, ImuConfig, block};
@@ -49,6 +49,6 @@ impl Levelling {
         let seconds = stamp.seconds_since(since);
         let text =
             format!("attitude found after {seconds:.2} s: roll and pitch known to {sd:.1} deg");
-        Some(Note { level: NoteLevel::Info, text })
+        Some(Note::info(text))
     }
 }

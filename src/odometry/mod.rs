@@ -2,9 +2,7 @@
 
 mod back_end;
 mod buffer;
-mod clock;
 mod config;
-mod gyroscope;
 mod health;
 mod init;
 mod levelling;
@@ -18,7 +16,6 @@ mod runner;
 mod state_points;
 mod supervisor;
 mod truth;
-mod watch;
 mod window;
 
 pub use back_end::{BackEnd, FrameObservations};

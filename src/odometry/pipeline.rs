@@ -7,19 +7,20 @@ use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 use super::back_end::BackEnd;
 use super::buffer::EventBuffer;
 use super::config::OdometryConfig;
-use super::health::{Divergence, HealthSummary};
+use super::health::HealthSummary;
 use super::init::{Attempt, Evidence, Initializer};
 use super::levelling::Levelling;
-use super::report::{MapPointView, Note, NoteLevel, StageTimes, StepReport, map_views};
+use super::report::{MapPointView, Note, StageTimes, StepReport, map_views};
 use super::rest::RestDetector;
 use super::restart::{Legacy, Spread};
 use super::run::Run;
 use super::supervisor::{FrameEvidence, Supervisor};
 use super::truth::TruthTrack;
 use super::window::ImuCursor;
+use crate::fault::{Divergence, Episode};
 use crate::filter::{Calibration, FilterKind, KnownAttitude};
 use crate::inertial::{Belief, Propagator};
-use crate::sensor::{ImuSample, RgbdFrame, Stamp, TruthPose};
+use crate::sensor::{ImuSample, RgbdFrame, Stamp, Stream, TruthPose};
 use crate::tracking::{FrontEndFrame, TrackingConfig, Tracks, View};
 use crate::vision::Feature;
 
@@ -91,7 +92,7 @@ impl Odometry {
             buffer: EventBuffer::new(has_imu, &config.truth),
             run: None,
             legacy: None,
-            supervisor: Supervisor::new(&config.imu, &config.health),
+            supervisor: Supervisor::new(&config.faults, &config.imu, &config.health, has_imu),
             map_every: 0,
             stats: OdometryStats::default(),
         })
@@ -108,6 +109,11 @@ impl Odometry {
         }
     }
 
+    /// A message that came again, and was left out.
+    pub fn push_repeated(&mut self, stream: Stream, stamp: Stamp) {
+        self.supervisor.observe_repeated(stream, stamp);
+    }
+
     pub fn push_truth(&mut self, pose: TruthPose) {
         self.buffer.push_truth(pose);
     }
@@ -116,10 +122,7 @@ impl Odometry {
         if self.supervisor.stops() {
             return;
         }
-        let time = self.frame_time(frame.frame.stamp);
-        if self.buffer.push_frame(frame, self.config.camera.time_offset) && self.buffer.has_imu() {
-            self.supervisor.observe_frame_time(time);
-        }
+        self.buffer.push_frame(frame, self.config.camera.time_offset);
     }
 
     /// No more data will come: what waits is processed with what there is.
@@ -133,6 +136,11 @@ impl Odometry {
         let seconds_at_rest = summary.seconds_at_rest + rest;
         let health = HealthSummary { seconds_at_rest, ..summary.clone() };
         OdometryStats { out_of_order: self.buffer.out_of_order, health, ..self.stats.clone() }
+    }
+
+    /// Faults so far, those that go on last.
+    pub fn faults(&self) -> Vec<Episode> {
+        self.supervisor.episodes()
     }
 
     pub fn truth(&self) -> &TruthTrack {
@@ -189,7 +197,7 @@ impl Odometry {
         let run = run.as_mut()?;
         let mut laps = StageClock::start(front.seconds);
         let detected = Detected::of(&front.extraction.features);
-        supervisor.observe_features(front.frame.stamp, &front.extraction.features, front.size());
+        supervisor.observe_frame(time, detected.features);
 
         let window = run.cursor.window_until(time, &mut buffer.imu);
         run.propagate(&window, supervisor, buffer.has_imu());
@@ -289,7 +297,7 @@ impl Odometry {
                         text
                     }
                 };
-                self.supervisor.note(Note { level: NoteLevel::Info, text });
+                self.supervisor.note(Note::info(text));
             }
         }
         Some(())

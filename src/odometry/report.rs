@@ -3,6 +3,7 @@
 use nalgebra::{Isometry3, Matrix3};
 use serde::Serialize;
 
+use crate::fault::{Decision, Fault};
 use crate::filter::{Calibration, Gating};
 use crate::inertial::{NavCovariance, NavState};
 use crate::map::{Map, MapPoint};
@@ -97,10 +98,32 @@ pub enum NoteLevel {
 }
 
 /// An event worth a line in the log (initialised, gap, lost, recovered, ...).
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Note {
     pub level: NoteLevel,
+    /// The fault that it tells of.
+    pub fault: Option<Fault>,
     pub text: String,
+}
+
+impl Note {
+    pub fn info(text: String) -> Self {
+        Self { level: NoteLevel::Info, fault: None, text }
+    }
+
+    pub fn warning(text: String) -> Self {
+        Self { level: NoteLevel::Warning, fault: None, text }
+    }
+
+    /// Of a fault that has just been named.
+    pub fn of(decision: &Decision, at: Stamp) -> Self {
+        let Decision { fault, reaction, since, statistic } = decision;
+        let text = format!(
+            "{fault} at {at} s, since {since} s (statistic {statistic:.1} of its threshold): \
+             {reaction}"
+        );
+        Self { level: NoteLevel::Warning, fault: Some(*fault), text }
+    }
 }
 
 /// The pipeline's account of one camera frame.

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use nalgebra::Vector3;
 
-use super::report::{Note, NoteLevel};
+use super::report::Note;
 use crate::filter::ZeroVelocity;
 use crate::inertial::{ImuConfig, NavState, StandstillCheck, StandstillConfig};
 use crate::sensor::{ImuSample, Stamp};
@@ -135,7 +135,7 @@ impl RestDetector {
                     "at rest at {stamp} s: IMU likelihood ratio {ratio:.2} (limit 1), features \
                      move at {speed:.4} m/s (limit {limit})"
                 );
-                Some(Note { level: NoteLevel::Info, text })
+                Some(Note::info(text))
             }
             (Some(since), signs) => {
                 let reason = self.end(signs)?;
@@ -143,7 +143,7 @@ impl RestDetector {
                 let length = stamp.seconds_since(since);
                 self.seconds += length;
                 let text = format!("moving again at {stamp} s, after {length:.2} s: {reason}");
-                Some(Note { level: NoteLevel::Info, text })
+                Some(Note::info(text))
             }
             _ => None,
         }

@@ -1,6 +1,6 @@
 use nalgebra::{Matrix3, SVector, UnitQuaternion, Vector3};
 
-use super::health::Divergence;
+use crate::fault::Divergence;
 use crate::filter::FilterConfig;
 use crate::inertial::{Belief, NavCovariance, NavState, block};
 use crate::map::Map;

@@ -11,6 +11,7 @@ use super::rest::RestDetector;
 use super::restart::Spread;
 use super::supervisor::{FrameEvidence, PoseVerdict, Supervisor};
 use super::window::{ImuCursor, ImuWindow};
+use crate::fault::Obstruction;
 use crate::filter::{Calibration, FilterConfig, PointObservation, PointUpdate};
 use crate::inertial::{Belief, NavCovariance};
 use crate::map::{ReferenceView, Sighting};
@@ -106,6 +107,9 @@ impl Run {
         let features = &front.extraction.features;
         let tracker = FrameTracker { view: *view, map: self.back_end.map(), prediction };
         let tracks = tracker.track(features);
+        let expected = tracker.recent_points(&tracks).into_iter();
+        let pixels = features.iter().map(|feature| feature.pixel);
+        supervisor.observe_regions(stamp, Obstruction::regions(pixels, expected, view.size));
         let Some(pose) = tracks.pose else { return tracks };
         if !self.back_end.filter().knows_vertical() || !self.back_end.holds_points() {
             return tracks;
@@ -115,12 +119,12 @@ impl Run {
         match supervisor.judge_pose(stamp, &world_from_body, in_view) {
             PoseVerdict::Consistent => tracks,
             PoseVerdict::Unconfirmed => tracks.without_pose(),
-            PoseVerdict::Kidnapped(jump, seen) => {
+            PoseVerdict::Kidnapped => {
                 let way = self.belief().state.world_from_body.inv_mul(&world_from_body);
                 if let Some(points) = self.back_end.filter_mut().point_state_mut() {
                     points.reset_pose(&way, &spread_of_recognition(filter));
                 }
-                supervisor.note(jump.note(stamp, seen));
+                supervisor.observe_kidnapping(stamp);
                 prediction.belief = *self.belief();
                 view.shutter = prediction.shutter(view.config, view.size.1, None);
                 let again = FrameTracker { view: *view, map: self.back_end.map(), prediction }
@@ -196,41 +200,46 @@ impl Run {
             supervisor.note(note);
         }
         supervisor.observe_sight(seen);
-        if let Some(note) = self.observe_rest(stamp, seen.tracks, view, config.standstill.update) {
-            supervisor.note(note);
-        }
+        self.observe_rest(seen, view, config.standstill.update, supervisor);
         if supervisor.observe_update(seen, self.belief()) {
             self.levelling.reopen(self.back_end.filter_mut(), stamp, &config.imu);
         }
         let contradicted = seen.update.is_some_and(PointUpdate::contradicts);
         self.levelling.weigh(self.back_end.belief(), contradicted, &config.imu);
+        supervisor.observe_world_turn(seen.update.and_then(|update| update.frame.world_turn));
         supervisor.judge_belief(stamp, self.belief(), seen.update.map(|update| update.nis));
         self.seeing_frames += u64::from(!supervisor.is_lost());
         if self.gives_up_map(seen.visible, seen.update.is_some(), config.map.max_unseen_frames) {
             supervisor.observe_map_loss(stamp);
         }
+        supervisor.name_fault(stamp);
     }
 
-    /// Conditions the belief on rest if the body is at rest and `updates`; a note where that begins
+    /// Conditions the belief on rest if the body is at rest and `updates`; notes where that begins
     /// or ends.
     fn observe_rest(
         &mut self,
-        stamp: Stamp,
-        tracks: &Tracks,
+        seen: &FrameEvidence,
         view: &View,
         updates: bool,
-    ) -> Option<Note> {
-        let seen = tracks
+        supervisor: &mut Supervisor,
+    ) {
+        let stamp = seen.stamp;
+        let seen = seen
+            .tracks
             .agreeing()
             .map(|m| (m.point, in_body(&m.correspondence.measurement, view).0))
             .collect();
         let (rest, note) = self.rest.judge(stamp, &self.back_end.belief().state, seen);
-        if let Some(rest) = rest.filter(|_| updates)
-            && let Err(error) = self.back_end.rest(&rest)
-        {
-            tracing::debug!("rest at {stamp} s was refused: {error}");
+        let change = rest.filter(|_| updates).map(|rest| self.back_end.rest(&rest));
+        match change {
+            Some(Ok(change)) => supervisor.observe_world_turn(change.world_turn),
+            Some(Err(error)) => tracing::debug!("rest at {stamp} s was refused: {error}"),
+            None => {}
         }
-        note
+        if let Some(note) = note {
+            supervisor.note(note);
+        }
     }
 
     /// Gives the map up when nothing of it has been found again for as many frames as `patience`

@@ -70,6 +70,9 @@ pub fn run(
                 odometry.push_imu(sample);
             }
             Prepared::Other(Event::Truth(pose)) => odometry.push_truth(pose),
+            Prepared::Other(Event::Repeated(stream, stamp)) => {
+                odometry.push_repeated(stream, stamp);
+            }
             Prepared::Other(Event::Frame(_)) => {}
             Prepared::Frame(frame) => odometry.push_frame(frame),
         }

@@ -1,26 +1,23 @@
 //! What can go wrong with sensors and estimate, watched in one place: evidence in, trust and
 //! reactions out.
 
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
-use super::clock::ClockWatch;
-use super::gyroscope::GyroscopeWatch;
-use super::health::{Divergence, Health, HealthConfig, HealthSummary, Sight};
-use super::recognition::{Jump, confirms};
-use super::report::{Note, NoteLevel};
-use super::watch::{Agreement, SensorWatch};
+use super::health::{Health, HealthConfig, HealthSummary, Sight};
+use super::recognition::confirms;
+use super::report::Note;
 use super::window::ImuWindow;
+use crate::fault::{Divergence, Episode, FaultConfig, Monitors, PoseStep, Region, Trust};
 use crate::filter::PointUpdate;
 use crate::inertial::{Belief, ImuConfig};
-use crate::sensor::{ImuSample, Stamp};
+use crate::sensor::{ImuSample, Stamp, Stream};
 use crate::tracking::{InView, Tracks};
-use crate::vision::Feature;
 
 /// Watches the sensors and the estimate.
 pub(super) struct Supervisor {
-    sensors: SensorWatch,
-    clock: ClockWatch,
-    gyroscope: GyroscopeWatch,
+    monitors: Monitors,
+    has_imu: bool,
+    max_rate: f64,
     health: Health,
     /// The last belief that nothing spoke against, and its time.
     sound: Option<(Stamp, Belief)>,
@@ -45,15 +42,20 @@ pub(super) enum PoseVerdict {
     /// Far from where the body can be, and what should be in view there is not.
     Unconfirmed,
     /// Far from where the body can be: it was carried off.
-    Kidnapped(Jump, InView),
+    Kidnapped,
 }
 
 impl Supervisor {
-    pub fn new(imu: &ImuConfig, health: &HealthConfig) -> Self {
+    pub fn new(
+        faults: &FaultConfig,
+        imu: &ImuConfig,
+        health: &HealthConfig,
+        has_imu: bool,
+    ) -> Self {
         Self {
-            sensors: SensorWatch::new(imu),
-            clock: ClockWatch::default(),
-            gyroscope: GyroscopeWatch::default(),
+            monitors: Monitors::new(faults, imu),
+            has_imu,
+            max_rate: faults.max_rate,
             health: Health::new(health),
             sound: None,
             notes: Vec::new(),
@@ -65,7 +67,7 @@ impl Supervisor {
     }
 
     pub fn warn(&mut self, text: String) {
-        self.notes.push(Note { level: NoteLevel::Warning, text });
+        self.notes.push(Note::warning(text));
     }
 
     /// The notes of a frame.
@@ -74,27 +76,31 @@ impl Supervisor {
     }
 
     pub fn observe_imu(&mut self, sample: &ImuSample) {
-        self.notes.extend(self.sensors.imu(sample));
-        self.clock.imu(*sample);
+        self.monitors.imu(sample);
     }
 
-    /// Of a frame's time by the IMU's clock.
-    pub fn observe_frame_time(&mut self, time: Stamp) {
-        self.clock.frame(time);
+    pub fn observe_repeated(&mut self, stream: Stream, stamp: Stamp) {
+        self.monitors.repeated(stream, stamp);
     }
 
-    pub fn observe_features(&mut self, stamp: Stamp, features: &[Feature], size: (usize, usize)) {
-        self.notes.extend(self.sensors.frame(stamp, features, size));
+    /// Of a frame, timed by the IMU's clock, and the number of its features.
+    pub fn observe_frame(&mut self, time: Stamp, features: usize) {
+        self.monitors.frame(time, features);
     }
 
     /// What the clocks are found to differ by beyond what is configured, s.
     pub fn clock_offset(&self) -> f64 {
-        self.clock.offset()
+        self.monitors.clock_offset()
     }
 
     /// Standard deviation of the stamps, s.
     pub fn stamp_jitter(&self) -> f64 {
-        self.clock.jitter()
+        self.monitors.stamp_jitter()
+    }
+
+    /// Faults so far.
+    pub fn episodes(&self) -> Vec<Episode> {
+        self.monitors.episodes()
     }
 
     pub fn is_lost(&self) -> bool {
@@ -107,16 +113,18 @@ impl Supervisor {
         for gap in &window.gaps {
             let text =
                 format!("IMU gap of {:.3} s after {} s: bridged by vision", gap.length, gap.after);
-            self.warn(text);
+            self.note(Note::info(text));
         }
-        let doubtful = self.sensors.is_noisy(window.end) || self.clock.is_in_doubt();
+        let Trust { distrust_imu, replace_gyro, .. } = self.monitors.trust(window.end);
+        let seen_rate = self.monitors.seen_rate() + gyro_bias;
         let mut trusted = window.clone();
         let mut before = None;
         for interval in &mut trusted.intervals {
             interval.from = before.unwrap_or(interval.from);
-            interval.is_bridged |= doubtful || self.gyroscope.is_wrong();
-            let seconds = interval.to.stamp.seconds_since(interval.from.stamp);
-            interval.to = self.gyroscope.reading(interval.to, seconds, gyro_bias);
+            interval.is_bridged |= distrust_imu || replace_gyro;
+            if replace_gyro || interval.to.angular_velocity.norm() > self.max_rate {
+                interval.to.angular_velocity = seen_rate;
+            }
             before = Some(interval.to);
         }
         trusted
@@ -133,15 +141,21 @@ impl Supervisor {
         let Some((before, sound)) = &self.sound else { return PoseVerdict::Consistent };
         let in_sight = self.health.is_lost_in_sight();
         let in_the_dark = self.is_lost() && !in_sight;
-        let after = stamp.seconds_since(*before);
-        let jump = Jump::between(&sound.state, world_from_body, after, in_the_dark);
-        if !in_sight && jump.is_none() {
+        let step = PoseStep {
+            before: sound.state.world_from_body,
+            velocity: sound.state.velocity,
+            before_at: *before,
+            after: *world_from_body,
+            unseen: in_the_dark,
+        };
+        let reachable = self.monitors.is_reachable(&step, stamp);
+        if !in_sight && reachable {
             return PoseVerdict::Consistent;
         }
-        match (in_view(), jump) {
-            (Some(seen), Some(jump)) if confirms(&seen) => PoseVerdict::Kidnapped(jump, seen),
-            (Some(seen), None) if confirms(&seen) => PoseVerdict::Consistent,
-            (seen, _) => {
+        match in_view() {
+            Some(seen) if confirms(&seen) && reachable => PoseVerdict::Consistent,
+            Some(seen) if confirms(&seen) => PoseVerdict::Kidnapped,
+            seen => {
                 tracing::debug!("at {stamp} s {seen:?} do not confirm a pose");
                 PoseVerdict::Unconfirmed
             }
@@ -157,27 +171,38 @@ impl Supervisor {
         gyro_bias: &Vector3<f64>,
     ) -> Option<f64> {
         let attitude = world_from_body.map(|pose| pose.rotation);
-        if let Some(attitude) = attitude {
-            self.notes.extend(self.gyroscope.attitude(stamp, attitude));
-        }
-        let (offset, note) = self.clock.attitude(stamp, attitude, gyro_bias)?;
-        self.notes.push(note);
-        Some(offset)
+        self.monitors.attitude(stamp, attitude, gyro_bias)
+    }
+
+    /// The body was carried off.
+    pub fn observe_kidnapping(&mut self, stamp: Stamp) {
+        self.monitors.carried_off(stamp);
+    }
+
+    /// What became of the points that were seen just before, by parts of the image.
+    pub fn observe_regions(&mut self, stamp: Stamp, regions: Vec<Region>) {
+        self.monitors.regions(stamp, regions);
+    }
+
+    /// The world was turned, and the map with it.
+    pub fn observe_world_turn(&mut self, turn: Option<UnitQuaternion<f64>>) {
+        turn.iter().for_each(|turn| self.monitors.turn_world(turn));
     }
 
     /// Judges sight, agreement and biases after an update. True if the levelling is to be doubted.
     pub fn observe_update(&mut self, evidence: &FrameEvidence, belief: &Belief) -> bool {
         let FrameEvidence { stamp, tracks, update, .. } = *evidence;
-        let agreement = Agreement {
-            matches: tracks.matches.len(),
-            inliers: tracks.inliers.len(),
-            others: tracks.second_motion,
-            contradicted: update.is_some_and(PointUpdate::contradicts),
-        };
-        self.notes.extend(self.sensors.agreement(stamp, agreement));
-        self.notes.extend(self.sensors.gyro_bias(stamp, &belief.state));
-        self.notes.extend(self.sensors.accel_bias(stamp, &belief.state));
-        self.sensors.accel_bias_lasts(stamp) && !self.sensors.is_noisy(stamp)
+        let (matches, inliers) = (tracks.matches.len(), tracks.inliers.len());
+        self.monitors.tracks(stamp, matches, inliers, tracks.second_motion);
+        if update.is_some_and(PointUpdate::contradicts) {
+            self.monitors.contradicted(stamp);
+        }
+        // Without an IMU the biases carry the motion of the constant-velocity model.
+        if !self.has_imu {
+            return false;
+        }
+        self.monitors.biases(stamp, &belief.state);
+        self.monitors.accel_bias_lasts(stamp) && !self.monitors.trust(stamp).distrust_imu
     }
 
     /// Takes note of whether a frame corrected the belief.
@@ -195,7 +220,11 @@ impl Supervisor {
 
     /// Judges the belief after all that a frame told of it.
     pub fn judge_belief(&mut self, stamp: Stamp, belief: &Belief, nis: Option<f64>) {
-        self.notes.extend(self.health.judge(stamp, belief, nis));
+        let judged = self.health.judge(stamp, belief, nis);
+        if let Some(divergence) = self.health.divergence().filter(|_| judged.is_some()) {
+            self.monitors.diverged(stamp, divergence);
+        }
+        self.notes.extend(judged);
         if self.health.is_sound(nis) {
             self.sound = Some((stamp, *belief));
         }
@@ -205,12 +234,21 @@ impl Supervisor {
     pub fn observe_map_loss(&mut self, stamp: Stamp) {
         let note = self.health.map_given_up(stamp);
         self.notes.push(note);
+        if self.health.divergence() == Some(Divergence::View) {
+            self.monitors.diverged(stamp, Divergence::View);
+        }
+    }
+
+    /// Names the fault that explains all that a frame told, if there is a new one.
+    pub fn name_fault(&mut self, stamp: Stamp) {
+        let decision = self.monitors.decide(stamp);
+        self.notes.extend(decision.map(|decision| Note::of(&decision, stamp)));
     }
 
     /// Moves the memory of the last sound belief to another clock; gives the samples by it.
     pub fn retime(&mut self, offset: f64) -> impl Iterator<Item = ImuSample> {
         self.sound = self.sound.map(|(time, belief)| (time.offset_by(offset), belief));
-        self.clock.samples().copied()
+        self.monitors.samples().copied()
     }
 
     pub fn last_sound(&self) -> Option<&(Stamp, Belief)> {
@@ -229,6 +267,7 @@ impl Supervisor {
 
     pub fn restarted(&mut self, belief: &Belief) {
         self.health.restarted(belief);
+        self.monitors.restarted();
     }
 
     pub fn rested(&mut self, seconds: f64) {

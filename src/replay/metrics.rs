@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::Evaluation;
 use crate::dataset::ReadReport;
+use crate::fault::Fault;
 use crate::filter::Calibration;
 use crate::odometry::{HealthSummary, NoteLevel, OdometryStats, StageTimes};
 
@@ -52,6 +53,8 @@ pub struct LogEntry {
     /// Stamp of the frame, or of the message that was left out, s.
     pub seconds: f64,
     pub level: NoteLevel,
+    /// The fault that it tells of, if it does.
+    pub fault: Option<Fault>,
     pub text: String,
 }
 

@@ -18,7 +18,7 @@ use nalgebra::{Isometry3, Matrix6, UnitQuaternion, Vector3};
 
 pub use attitude::{AttitudeMetrics, AttitudeRequest, Reached, replay_attitude};
 pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors, evaluate};
-pub use faults::{FaultOutcome, Naming, Recovered, fault_grid};
+pub use faults::{FaultOutcome, Naming, Recovered, confusion, expected_name, fault_grid};
 pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
 pub use outputs::state_columns;
@@ -225,6 +225,7 @@ pub fn replay(
 /// The notes and, in order of time, what the reader left out.
 fn with_skipped(mut notes: Vec<LogEntry>, read: &ReadReport) -> Vec<LogEntry> {
     notes.extend(read.first_skipped.iter().map(|(reason, stamp)| LogEntry {
+        fault: None,
         seconds: stamp.seconds(),
         level: NoteLevel::Warning,
         text: format!(
@@ -412,7 +413,8 @@ impl Session {
                 NoteLevel::Warning => tracing::warn!("{}", note.text),
             }
             let (seconds, text) = (report.stamp.seconds(), note.text.clone());
-            self.notes.push(LogEntry { seconds, level: note.level, text });
+            let (level, fault) = (note.level, note.fault);
+            self.notes.push(LogEntry { seconds, level, fault, text });
         }
         let estimate = report.state.world_from_body;
         self.estimate.push(TruthPose { stamp: report.stamp, world_from_body: estimate });
@@ -436,7 +438,7 @@ impl Session {
             return Err(failure);
         }
         match self.outputs.take() {
-            Some(outputs) => outputs.finish(&odometry.map()),
+            Some(outputs) => outputs.finish(&odometry.map(), &odometry.faults()),
             None => Ok(()),
         }
     }

@@ -1,4 +1,4 @@
-//! The files of `replay --out DIR`: `trajectory.tum`, `state.csv`, `map.ply`.
+//! The files of `replay --out DIR`: `trajectory.tum`, `state.csv`, `map.ply`, `faults.json`.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::{Isometry3, Vector3};
 
 use super::error::ReplayError;
+use crate::fault::Episode;
 use crate::filter::{Calibration, calibration_block};
 use crate::inertial::{NavCovariance, NavState, block};
 use crate::odometry::{MapPointView, StepReport};
@@ -58,8 +59,9 @@ impl Outputs {
         self.state.line(&state_line(report))
     }
 
-    pub fn finish(self, map: &[MapPointView]) -> Result<(), ReplayError> {
+    pub fn finish(self, map: &[MapPointView], faults: &[Episode]) -> Result<(), ReplayError> {
         write_map(&self.directory.join("map.ply"), map)?;
+        write_faults(&self.directory.join("faults.json"), faults)?;
         self.trajectory.finish()?;
         self.state.finish()
     }
@@ -196,6 +198,14 @@ fn optional_field(value: Option<f64>) -> String {
 }
 
 /// ASCII PLY of the map points: position (m, world), `sigma` (m), `age` (frames).
+/// One JSON object: the faults of the run in order of their end.
+fn write_faults(path: &Path, faults: &[Episode]) -> Result<(), ReplayError> {
+    let failed = |source| ReplayError::Write { path: path.to_owned(), source };
+    let object = serde_json::json!({ "faults": faults });
+    let text = serde_json::to_string_pretty(&object).map_err(|error| failed(error.into()))?;
+    std::fs::write(path, text + "\n").map_err(failed)
+}
+
 fn write_map(path: &Path, map: &[MapPointView]) -> Result<(), ReplayError> {
     let mut file = OutputFile::create(path.to_owned())?;
     file.line("ply\nformat ascii 1.0")?;

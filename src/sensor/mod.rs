@@ -11,7 +11,7 @@ mod imu;
 mod stamp;
 
 pub use camera::{CameraConfig, PinholeCamera};
-pub use event::{Event, TruthPose};
+pub use event::{Event, Stream, TruthPose};
 pub use frame::RgbdFrame;
 pub use image::{ColorImage, DepthImage, PixelFormat};
 pub use imu::{ImuSample, PositionFix};

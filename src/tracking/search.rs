@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Instant;
 
-use nalgebra::{Isometry3, Point3};
+use nalgebra::{Isometry3, Point2, Point3};
 
 use super::association::{Association, place, seek};
 use super::pose::{Agreement, find_pose};
@@ -11,6 +11,11 @@ use super::view::{FrontEndFrame, Prediction, View};
 use crate::inertial::pose_covariance;
 use crate::map::{Map, MapPoint};
 use crate::vision::{Feature, Match, match_guided};
+
+/// A point that was seen in one of so many frames before, and in so many in all, is expected to be seen
+/// again.
+const RECENT_FRAMES: u64 = 2;
+const RECENT_OBSERVATIONS: u32 = 3;
 
 /// Looks for a map in one frame, from one prediction.
 #[derive(Debug)]
@@ -166,6 +171,25 @@ impl FrameTracker<'_> {
         let (width, height) = self.view.size;
         let ids = self.map.candidates(world_from_camera, self.view.camera, width, height);
         ids.into_iter().filter_map(|id| self.map.get(id)).filter(|point| point.held)
+    }
+
+    /// Where the points that were seen in the last frames are predicted now, pixels, and whether the
+    /// inliers of `tracks` have them.
+    pub fn recent_points(&self, tracks: &Tracks) -> Vec<(Point2<f64>, bool)> {
+        let found: BTreeSet<_> = tracks.agreeing().map(|m| m.point).collect();
+        let world_from_camera = self.prediction.world_from_camera();
+        let (width, height) = self.view.size;
+        let ids = self.map.candidates(&world_from_camera, self.view.camera, width, height);
+        let seen = |point: &&MapPoint| {
+            point.last_seen + RECENT_FRAMES >= self.prediction.seeing_frames
+                && point.observations >= RECENT_OBSERVATIONS
+        };
+        let place = |point: &MapPoint| {
+            let position = Point3::from(point.position);
+            let in_camera = world_from_camera.inverse_transform_point(&position).coords;
+            Some((self.view.project(&in_camera)?, found.contains(&point.id)))
+        };
+        ids.iter().filter_map(|id| self.map.get(*id)).filter(seen).filter_map(place).collect()
     }
 
     /// What is seen of the points of the state that the pose of `tracks` puts in view.

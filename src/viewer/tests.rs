@@ -77,10 +77,10 @@ impl Walk {
         let inliers = count(KeypointRole::Inlier);
         let mut notes = Vec::new();
         if frame == 0 {
-            notes.push(Note { level: NoteLevel::Info, text: "initialised at rest".to_owned() });
+            notes.push(Note::info("initialised at rest".to_owned()));
         }
         if frame == 40 {
-            notes.push(Note { level: NoteLevel::Warning, text: "IMU gap of 0.12 s".to_owned() });
+            notes.push(Note::warning("IMU gap of 0.12 s".to_owned()));
         }
         StepReport {
             frame,
