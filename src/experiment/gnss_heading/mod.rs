@@ -265,3 +265,66 @@ fn errors(step: &NavigationStep, truth: &NavState) -> Errors {
         gyro_bias: (truth.gyro_bias - state.gyro_bias).norm(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::SeedableRng;
+
+    /// One drive of each vehicle: the heading is found, and the errors are as large as claimed.
+    #[test]
+    fn mfgi_finds_the_heading_of_every_vehicle() {
+        let mut rng = ChaCha8Rng::seed_from_u64(12);
+        for cell in QUICK_CELLS.iter() {
+            let drive = Drive::new(cell.vehicle, &imu(), GUIDED + OUTAGE, &mut rng);
+            let mut trial = Trial::default();
+            run(cell, "mfgi", &drive, 0, &mut trial).unwrap();
+            let value = |quantity: &str| {
+                let found = trial.observations.iter().find(|o| o.quantity == quantity);
+                found.map(|o| o.value).unwrap()
+            };
+            assert_eq!(value("heading_not_found"), 0.0, "{}", cell.label);
+            for quantity in ["nees_heading", "nees_velocity", "nees_position"] {
+                let nees = value(quantity);
+                assert!(nees > 0.05 && nees < 10.0, "{} {quantity} {nees}", cell.label);
+            }
+        }
+    }
+
+    /// The sensors of a drive are those that the filters assume.
+    #[test]
+    fn a_drive_agrees_with_its_own_readings() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        for vehicle in Vehicle::ALL {
+            let quiet = ImuConfig {
+                gyro_noise: 0.0,
+                accel_noise: 0.0,
+                gyro_bias_walk: 0.0,
+                accel_bias_walk: 0.0,
+                accel_bias_sd: 0.0,
+                ..imu()
+            };
+            let drive = Drive::new(vehicle, &quiet, 10.0, &mut rng);
+            let mut state = drive.truth[0];
+            for pair in drive.imu.windows(2) {
+                let mean = |f: fn(&crate::sensor::ImuSample) -> Vector3<f64>| {
+                    (f(&pair[0]) + f(&pair[1])) * 0.5
+                };
+                let turn = (mean(|s| s.angular_velocity) - state.gyro_bias) * drive::STEP;
+                let middle = state.world_from_body.rotation
+                    * nalgebra::UnitQuaternion::from_scaled_axis(turn * 0.5);
+                let acceleration =
+                    middle * mean(|s| s.specific_force) - Vector3::z() * quiet.gravity;
+                let moved =
+                    state.velocity * drive::STEP + acceleration * (0.5 * drive::STEP * drive::STEP);
+                state.world_from_body.translation.vector += moved;
+                state.velocity += acceleration * drive::STEP;
+                state.world_from_body.rotation *= nalgebra::UnitQuaternion::from_scaled_axis(turn);
+            }
+            let last = drive.truth.last().unwrap();
+            let apart = state.world_from_body.inverse() * last.world_from_body;
+            assert!(apart.rotation.angle() < 2e-3, "{}", vehicle.name());
+            assert!(apart.translation.vector.norm() < 0.1, "{}", vehicle.name());
+        }
+    }
+}

@@ -459,7 +459,8 @@ fn weighted(parts: Vec<(f64, NavigationBelief)>) -> Result<Vec<Component>, Filte
     Ok(components)
 }
 
-/// The belief with the moments of `r = vec R` and `x` of all components.
+/// The belief with the moments of `R` and `x` of all components. They are added up in the principal
+/// axes of the new attitude: there the components of `q` have their own scales, which rounding keeps.
 fn merged(
     components: &[Component],
     regression: Regression,
@@ -470,6 +471,8 @@ fn merged(
         mean_r += belief.attitude.mean() * (weight / total);
         mean_x += belief.mean * (weight / total);
     }
+    let attitude = MatrixFisher::from_mean(&mean_r)?;
+    let (u, v) = (attitude.svd().u.inverse(), attitude.svd().v.inverse());
     let mut moments = JointMoments {
         x: EuclideanCovariance::zeros(),
         cross: Slope::zeros(),
@@ -477,18 +480,164 @@ fn merged(
     };
     for Component { weight, belief } in components {
         let svd = belief.attitude.svd();
-        let axes = svd.v.matrix().kronecker(svd.u.matrix());
+        let axes = (v * svd.v).matrix().kronecker((u * svd.u).matrix());
         let own = belief.joint_moments();
         let share = weight / total;
-        let r: Vector9 = vectorize(&(belief.attitude.mean() - mean_r));
+        let apart = u * (belief.attitude.mean() - mean_r) * v.inverse();
+        let q: Vector9 = vectorize(&apart);
         let x = belief.mean - mean_x;
-        moments.q += (axes * own.q * axes.transpose() + r * r.transpose()) * share;
-        moments.cross += (own.cross * axes.transpose() + x * r.transpose()) * share;
+        moments.q += (axes * own.q * axes.transpose() + q * q.transpose()) * share;
+        moments.cross += (own.cross * axes.transpose() + x * q.transpose()) * share;
         moments.x += (own.x + x * x.transpose()) * share;
     }
-    let attitude = MatrixFisher::from_mean(&mean_r)?;
-    let svd = attitude.svd();
-    let axes = svd.v.matrix().kronecker(svd.u.matrix());
-    let belief = NavigationBelief::from_moments(attitude, mean_x, &moments, &axes, regression)?;
+    let identity = Matrix9::identity();
+    let belief = NavigationBelief::from_moments(attitude, mean_x, &moments, &identity, regression)?;
     if belief.is_finite() { Ok(belief) } else { Err(FilterError::NotFinite("merged belief")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::distribution::matrix_fisher_gaussian::Correlation;
+    use crate::filter::gnss::InitialBelief;
+    use crate::inertial::ImuConfig;
+    use nalgebra::Isometry3;
+
+    const FULL: Regression = Regression::Full(Correlation::World);
+
+    fn initial(heading_sd: Option<f64>) -> NavigationBelief {
+        let state = NavState {
+            world_from_body: Isometry3::rotation(Vector3::new(0.2, -0.1, 0.7)),
+            velocity: Vector3::new(1.0, 0.5, 0.0),
+            gyro_bias: Vector3::zeros(),
+            accel_bias: Vector3::zeros(),
+        };
+        let initial = InitialBelief {
+            state,
+            tilt_sd: 0.05,
+            heading_sd,
+            velocity_sd: 0.02,
+            position_sd: 0.1,
+            gyro_bias_sd: 0.05,
+            accel_bias_sd: 0.01,
+        };
+        initial.matrix_fisher_gaussian().unwrap()
+    }
+
+    fn divided(belief: NavigationBelief) -> Mixture {
+        Mixture::new(belief, FULL, true).unwrap()
+    }
+
+    /// The density itself, at any heading and where the tilt is likely.
+    #[test]
+    fn windows_divide_a_density_exactly() {
+        for heading_sd in [None, Some(0.5)] {
+            let whole = initial(heading_sd);
+            let parts = divided(whole.clone());
+            assert!(parts.components().len() >= 10, "{}", parts.components().len());
+            let mode = whole.attitude.mode();
+            let nearby = if heading_sd.is_some() { 0.25 } else { 1.0 };
+            for k in 0..12 {
+                let heading = nearby * (0.5 * f64::from(k) - 3.0);
+                let tilt = 0.1 * Vector3::new((1.3 * heading).cos(), (1.3 * heading).sin(), 0.0);
+                let r = exp(&(Vector3::z() * heading)) * exp(&tilt) * mode;
+                let density: f64 = parts
+                    .components()
+                    .iter()
+                    .map(|part| part.weight * part.belief.attitude.log_density(&r).exp())
+                    .sum();
+                let ratio = density / whole.attitude.log_density(&r).exp();
+                assert!((ratio - 1.0).abs() < 5e-3, "{heading_sd:?} {heading}: {ratio}");
+            }
+        }
+    }
+
+    #[test]
+    fn merged_components_have_the_moments_of_all() {
+        let whole = initial(Some(0.5));
+        let parts = divided(whole.clone());
+        let merged = merged(parts.components(), FULL).unwrap();
+        assert!((merged.attitude.mean() - whole.attitude.mean()).amax() < 2e-3);
+        let turned = parts.summary();
+        let one = whole.summary();
+        assert!((merged.mean - whole.mean).amax() < 1e-9);
+        for k in 0..15 {
+            let ratio = turned.covariance[(k, k)] / one.covariance[(k, k)];
+            assert!((ratio - 1.0).abs() < 0.03, "{k}: {ratio}");
+        }
+    }
+
+    /// `Cov[v, d | R]` for the horizontal velocity across the specific force, as a correlation.
+    fn correlation_across(belief: &NavigationBelief, force: &Vector3<f64>) -> f64 {
+        let mode = belief.attitude.mode();
+        let across = Vector3::z().cross(&(mode * force)).normalize();
+        let up = mode.inverse() * Vector3::z();
+        let block = |row: usize, column: usize| {
+            belief.conditional.fixed_view::<3, 3>(row, column).into_owned()
+        };
+        let cross = across.dot(&(block(VELOCITY, GYRO_BIAS) * up));
+        let variances = [
+            across.dot(&(block(VELOCITY, VELOCITY) * across)),
+            up.dot(&(block(GYRO_BIAS, GYRO_BIAS) * up)),
+        ];
+        cross / (variances[0] * variances[1]).sqrt()
+    }
+
+    /// What a vertical bias does to the velocity turns with the heading; one density averages it to
+    /// nothing, the components keep it.
+    #[test]
+    fn components_keep_what_turns_with_the_heading() {
+        let config = ImuConfig { gyro_noise: 1e-4, accel_noise: 1e-3, ..ImuConfig::default() };
+        let propagator = MomentPropagator::new(&config);
+        let mut single = Mixture::new(initial(None), FULL, false).unwrap();
+        let mut parts = divided(initial(None));
+        let level = single.components()[0].belief.attitude.mode();
+        let acceleration = Vector3::new(1.5, 0.0, 0.0);
+        let force = level.inverse() * (acceleration + Vector3::z() * config.gravity);
+        for _ in 0..150 {
+            for mixture in [&mut single, &mut parts] {
+                mixture.propagate(&propagator, &Vector3::zeros(), &force, 0.02).unwrap();
+            }
+        }
+        let push = level.inverse() * acceleration;
+        let lost = correlation_across(&single.components()[0].belief, &push);
+        assert!(lost.abs() < 0.1, "{lost}");
+        for part in parts.components().iter().filter(|part| part.weight > 0.02) {
+            let kept = correlation_across(&part.belief, &push);
+            assert!(kept.abs() > 0.6, "{kept}");
+        }
+    }
+
+    #[test]
+    fn components_are_merged_once_the_heading_is_known() {
+        let config = ImuConfig { gyro_noise: 1e-4, accel_noise: 1e-3, ..ImuConfig::default() };
+        let propagator = MomentPropagator::new(&config);
+        let mut mixture = divided(initial(None));
+        let heading = exp(&(Vector3::z() * 2.0));
+        let truth = heading
+            * Rotation3::from(
+                Isometry3::rotation(Vector3::new(0.2, -0.1, 0.7)).rotation.to_rotation_matrix(),
+            );
+        let (mut position, mut velocity) = (Vector3::zeros(), Vector3::new(1.0, 0.5, 0.0));
+        let h = 0.02;
+        for k in 1..=250 {
+            let acceleration = truth * Vector3::new((0.03 * f64::from(k)).cos(), 0.8, 0.0);
+            let force = truth.inverse() * (acceleration + Vector3::z() * config.gravity);
+            mixture.propagate(&propagator, &Vector3::zeros(), &force, h).unwrap();
+            position += velocity * h + acceleration * (0.5 * h * h);
+            velocity += acceleration * h;
+            if k % 10 == 0 {
+                let fix = PositionMeasurement {
+                    in_world: position,
+                    covariance: Matrix3::identity() * 0.01_f64.powi(2),
+                    lever_arm: Vector3::zeros(),
+                };
+                mixture.update_position(&fix, AttitudeUpdate::Flow).unwrap();
+            }
+        }
+        assert_eq!(mixture.components().len(), 1);
+        let error =
+            log(&(mixture.state().world_from_body.rotation.to_rotation_matrix() * truth.inverse()));
+        assert!(error.z.abs() < 0.05, "{error}");
+    }
 }
