@@ -63,7 +63,13 @@ pub fn read_position_table(path: &Path) -> Result<Vec<PositionFix>, LogError> {
     let mut table = NamedTable::open(path)?;
     let stamp = table.column("stamp", STAMP)?;
     let position = table.columns("position", POSITION)?;
-    table.rows(|row| Ok(PositionFix { stamp: row.stamp(stamp)?, position: finite(row, position)? }))
+    table.rows(|row| {
+        Ok(PositionFix {
+            stamp: row.stamp(stamp)?,
+            position: finite(row, position)?,
+            covariance: None,
+        })
+    })
 }
 
 fn finite(row: &Row, columns: [usize; 3]) -> Result<Vector3<f64>, String> {

@@ -237,7 +237,8 @@ fn filters(
         ("mfgi-paper", Regression::Projected(world), points),
         ("mfgb-paper", Regression::Projected(body), points),
     ] {
-        let options = MfgOptions { name, regression, update };
+        let divided = matches!(regression, Regression::Full(_));
+        let options = MfgOptions { name, regression, update, divided };
         filters.push(Box::new(MfgGnss::new(imu, options, initial)?));
     }
     Ok(filters)

@@ -6,6 +6,7 @@
 mod alignment;
 mod attitude;
 mod gnss;
+mod gnss_heading;
 mod lab;
 mod landmarks;
 pub mod matrix_fisher;
@@ -18,8 +19,14 @@ pub use study::{
 
 /// Every study, in the order of `experiment --list`.
 pub fn studies() -> impl Iterator<Item = &'static Study> {
-    let studies =
-        [matrix_fisher::STUDIES, gnss::STUDIES, alignment::STUDIES, visual::STUDIES, lab::STUDIES];
+    let studies = [
+        matrix_fisher::STUDIES,
+        gnss::STUDIES,
+        gnss_heading::STUDIES,
+        alignment::STUDIES,
+        visual::STUDIES,
+        lab::STUDIES,
+    ];
     studies.into_iter().chain(attitude::STUDIES).flatten()
 }
 

@@ -1,4 +1,4 @@
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 
 use super::Stamp;
 
@@ -38,4 +38,6 @@ pub struct PositionFix {
     pub stamp: Stamp,
     /// World coordinates (local, z up), m.
     pub position: Vector3<f64>,
+    /// Of the position, m^2; `None` where the log tells none.
+    pub covariance: Option<Matrix3<f64>>,
 }

@@ -6,6 +6,7 @@
 mod camera;
 mod event;
 mod frame;
+mod geodesy;
 mod image;
 mod imu;
 mod stamp;
@@ -13,6 +14,7 @@ mod stamp;
 pub use camera::{CameraConfig, PinholeCamera};
 pub use event::{Event, Stream, TruthPose};
 pub use frame::RgbdFrame;
+pub use geodesy::{Datum, Geodetic};
 pub use image::{ColorImage, DepthImage, PixelFormat};
 pub use imu::{ImuSample, PositionFix};
 pub use stamp::Stamp;

@@ -1,6 +1,6 @@
 //! The belief of the matrix Fisher-Gaussian filters and its projections.
 
-use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector3};
 
 use super::central::{Matrix9, mean_and_covariance};
 use crate::distribution::matrix_fisher::{MatrixFisher, MatrixFisherError};
@@ -129,11 +129,16 @@ impl NavigationBelief {
 
     /// Mode of the attitude and mean of the rest.
     pub fn state(&self) -> NavState {
-        let part = |start: usize| self.mean.fixed_rows::<3>(start).into_owned();
+        Self::state_of(&self.attitude.mode(), &self.mean)
+    }
+
+    /// An attitude and a Euclidean part as plain values.
+    pub fn state_of(attitude: &Rotation3<f64>, mean: &Euclidean) -> NavState {
+        let part = |start: usize| mean.fixed_rows::<3>(start).into_owned();
         NavState {
             world_from_body: nalgebra::Isometry3::from_parts(
                 part(POSITION).into(),
-                nalgebra::UnitQuaternion::from_rotation_matrix(&self.attitude.mode()),
+                nalgebra::UnitQuaternion::from_rotation_matrix(attitude),
             ),
             velocity: part(VELOCITY),
             gyro_bias: part(GYRO_BIAS),

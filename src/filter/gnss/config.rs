@@ -2,9 +2,10 @@ use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-use super::AttitudeUpdate;
+use super::{AttitudeUpdate, ConsistencyConfig};
 use crate::filter::PositionMeasurement;
 use crate::inertial::ImuConfig;
+use crate::sensor::PositionFix;
 
 /// Everything an IMU-GNSS run can be told, by section.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -14,6 +15,7 @@ pub struct GnssConfig {
     pub receiver: ReceiverConfig,
     pub start: StartConfig,
     pub filter: GnssFilterConfig,
+    pub consistency: ConsistencyConfig,
     pub outage: OutageConfig,
     pub output: OutputConfig,
 }
@@ -22,10 +24,14 @@ pub struct GnssConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ReceiverConfig {
-    /// Standard deviation of a fix along each horizontal axis, m.
+    /// Standard deviation of a fix along each horizontal axis, m, where the log tells none.
     pub horizontal_noise: f64,
-    /// Standard deviation of a fix along the vertical, m.
+    /// Standard deviation of a fix along the vertical, m, where the log tells none.
     pub vertical_noise: f64,
+    /// Whether the covariance that a log tells of a fix counts.
+    pub use_log_covariance: bool,
+    /// By what the standard deviations of fixes are multiplied, told or configured.
+    pub noise_scale: f64,
     /// Standard deviation, m, of what is added to each axis of a fix that lies within a stretch of
     /// interpolated IMU samples, because such a log has interpolated positions, too.
     pub interpolated_noise: f64,
@@ -46,6 +52,8 @@ impl Default for ReceiverConfig {
         Self {
             horizontal_noise: 1.0,
             vertical_noise: 2.0,
+            use_log_covariance: true,
+            noise_scale: 1.0,
             interpolated_noise: 0.0,
             lever_arm: [0.0; 3],
             gate_probability: 1.0,
@@ -55,19 +63,17 @@ impl Default for ReceiverConfig {
 }
 
 impl ReceiverConfig {
-    /// The measurement that is a fix, `interpolated` with the IMU's samples around it or not.
-    pub(super) fn measurement(
-        &self,
-        position: Vector3<f64>,
-        interpolated: bool,
-    ) -> PositionMeasurement {
+    /// The measurement that is a fix, `interpolated` with the IMU's samples around it or not. Its
+    /// noise is what the log tells of it, else that of the configuration.
+    pub(super) fn measurement(&self, fix: &PositionFix, interpolated: bool) -> PositionMeasurement {
         let added = if interpolated { self.interpolated_noise.powi(2) } else { 0.0 };
         let (horizontal, vertical) = (self.horizontal_noise.powi(2), self.vertical_noise.powi(2));
+        let configured = Matrix3::from_diagonal(&Vector3::new(horizontal, horizontal, vertical));
+        let told = fix.covariance.filter(|_| self.use_log_covariance);
         PositionMeasurement {
-            in_world: position,
-            covariance: Matrix3::from_diagonal(
-                &Vector3::new(horizontal, horizontal, vertical).add_scalar(added),
-            ),
+            in_world: fix.position,
+            covariance: told.unwrap_or(configured) * self.noise_scale.powi(2)
+                + Matrix3::from_diagonal_element(added),
             lever_arm: Vector3::from(self.lever_arm),
         }
     }
@@ -192,6 +198,7 @@ impl GnssConfig {
             ("imu.max_gap", self.imu.max_gap),
             ("receiver.horizontal_noise", self.receiver.horizontal_noise),
             ("receiver.vertical_noise", self.receiver.vertical_noise),
+            ("receiver.noise_scale", self.receiver.noise_scale),
             ("start.tilt_sd", self.start.tilt_sd),
             ("start.heading_sd", self.start.heading_sd),
             ("start.velocity_sd", self.start.velocity_sd),
@@ -206,6 +213,7 @@ impl GnssConfig {
             ("receiver.interpolated_noise", self.receiver.interpolated_noise),
             ("receiver.gate_probability", self.receiver.gate_probability),
             ("filter.surprise_probability", self.filter.surprise_probability),
+            ("consistency.false_alarm_probability", self.consistency.false_alarm_probability),
             ("start.window", self.start.window),
             ("start.converged_heading_sd", self.start.converged_heading_sd),
             ("outage.start", self.outage.start),

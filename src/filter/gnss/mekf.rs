@@ -20,7 +20,12 @@ pub struct MekfGnss {
 
 impl MekfGnss {
     pub fn new(imu: &ImuConfig, initial: &InitialBelief) -> Result<Self, FilterError> {
-        Ok(Self { propagator: Propagator::inertial(imu), belief: initial.gaussian()? })
+        Ok(Self::with_belief(imu, initial.gaussian()?))
+    }
+
+    /// A filter that goes on from a belief.
+    pub fn with_belief(imu: &ImuConfig, belief: Belief) -> Self {
+        Self { propagator: Propagator::inertial(imu), belief }
     }
 }
 
@@ -95,7 +100,7 @@ impl Linear {
 }
 
 /// The state corrected by an error.
-fn moved(state: &NavState, error: &SVector<f64, 15>) -> NavState {
+pub(crate) fn moved(state: &NavState, error: &SVector<f64, 15>) -> NavState {
     let part = |start: usize| error.fixed_rows::<3>(start).into_owned();
     let mut moved = *state;
     let turn = UnitQuaternion::from_scaled_axis(part(block::ROTATION));

@@ -1,8 +1,8 @@
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use nalgebra::{Rotation3, Vector3};
 
-use super::belief::{NavigationBelief, POSITION};
+use super::belief::POSITION;
+use super::mixture::Mixture;
 use super::propagation::MomentPropagator;
-use super::update::{innovation, update_attitude, update_position};
 use super::{AttitudeUpdate, GnssFilter, InitialBelief, Innovation, Regression};
 use crate::filter::{
     AttitudeMeasurement, BayesFilter, Estimate, FilterError, InertialStep, PositionMeasurement,
@@ -16,6 +16,9 @@ pub struct MfgOptions {
     pub name: &'static str,
     pub regression: Regression,
     pub update: AttitudeUpdate,
+    /// Whether a belief that is broad in heading is divided into several, so that a gyroscope bias
+    /// may be as unknown; the paper's filters carry one.
+    pub divided: bool,
 }
 
 /// The matrix Fisher-Gaussian filter for IMU and GNSS (W22 5.1).
@@ -23,7 +26,7 @@ pub struct MfgOptions {
 pub struct MfgGnss {
     options: MfgOptions,
     propagator: MomentPropagator,
-    belief: NavigationBelief,
+    belief: Mixture,
 }
 
 impl MfgGnss {
@@ -32,13 +35,14 @@ impl MfgGnss {
         options: MfgOptions,
         initial: &InitialBelief,
     ) -> Result<Self, FilterError> {
-        let belief = initial.matrix_fisher_gaussian()?;
+        let MfgOptions { regression, divided, .. } = options;
+        let belief = Mixture::new(initial.matrix_fisher_gaussian()?, regression, divided)?;
         Ok(Self { options, propagator: MomentPropagator::new(imu), belief })
     }
 
-    fn add_evidence(&mut self, parameter: &Matrix3<f64>) -> Result<(), FilterError> {
-        self.belief = update_attitude(&self.belief, parameter, self.options.regression)?;
-        Ok(())
+    /// Number of matrix Fisher-Gaussian densities that make up the belief.
+    pub fn components(&self) -> usize {
+        self.belief.components().len()
     }
 }
 
@@ -50,33 +54,28 @@ impl BayesFilter for MfgGnss {
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
         let force = step.specific_force.ok_or(FilterError::NoSpecificForce)?;
-        let rate = &step.angular_velocity;
-        let regression = self.options.regression;
-        self.belief = self.propagator.step(&self.belief, rate, &force, step.seconds, regression)?;
-        Ok(())
+        self.belief.propagate(&self.propagator, &step.angular_velocity, &force, step.seconds)
     }
 
     fn update_attitude(&mut self, measured: &AttitudeMeasurement) -> Result<(), FilterError> {
         measured.check()?;
-        self.add_evidence(&measured.parameter())
+        self.belief.update_attitude(&measured.parameter())
     }
 
     fn update_directions(&mut self, measured: &[VectorMeasurement]) -> Result<(), FilterError> {
-        self.add_evidence(&VectorMeasurement::joint_parameter(measured)?)
+        self.belief.update_attitude(&VectorMeasurement::joint_parameter(measured)?)
     }
 
     fn update_position(&mut self, measured: &PositionMeasurement) -> Result<(), FilterError> {
-        let MfgOptions { regression, update, .. } = self.options;
-        self.belief = update_position(&self.belief, measured, update, regression)?;
-        Ok(())
+        self.belief.update_position(measured, self.options.update)
     }
 
     fn attitude(&self) -> Rotation3<f64> {
-        self.belief.attitude.mode()
+        self.state().world_from_body.rotation.to_rotation_matrix()
     }
 
     fn estimate(&self) -> Estimate {
-        super::estimate(&self.belief(), Some(self.belief.attitude.svd().s))
+        super::estimate(&self.belief(), self.concentration())
     }
 
     fn gyro_bias(&self) -> Option<Vector3<f64>> {
@@ -86,12 +85,12 @@ impl BayesFilter for MfgGnss {
 
 impl GnssFilter for MfgGnss {
     fn innovation(&self, position: &PositionMeasurement) -> Result<Innovation, FilterError> {
-        innovation(&self.belief, position)
+        self.belief.innovation(position)
     }
 
     fn loosen_position(&mut self, variance: f64) {
-        for k in POSITION..POSITION + 3 {
-            self.belief.conditional[(k, k)] += variance;
+        for belief in self.belief.components_mut() {
+            (POSITION..POSITION + 3).for_each(|k| belief.conditional[(k, k)] += variance);
         }
     }
 
@@ -100,8 +99,7 @@ impl GnssFilter for MfgGnss {
     }
 
     fn enlarge(&mut self, factor: f64) -> Result<(), FilterError> {
-        self.belief = self.belief.enlarged(factor)?;
-        Ok(())
+        self.belief.enlarge(factor)
     }
 
     fn belief(&self) -> Belief {
@@ -110,5 +108,9 @@ impl GnssFilter for MfgGnss {
 
     fn state(&self) -> NavState {
         self.belief.state()
+    }
+
+    fn concentration(&self) -> Option<Vector3<f64>> {
+        Some(self.belief.concentration())
     }
 }

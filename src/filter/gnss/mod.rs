@@ -14,8 +14,10 @@
 mod belief;
 mod central;
 mod config;
+mod consistency;
 mod mekf;
 mod mfg;
+mod mixture;
 mod navigation;
 mod propagation;
 mod start;
@@ -32,10 +34,14 @@ pub use belief::Regression;
 pub use config::{
     GnssConfig, GnssFilterConfig, OutageConfig, OutputConfig, ReceiverConfig, StartConfig,
 };
+pub use consistency::{Consistency, ConsistencyConfig};
 pub use mekf::MekfGnss;
+pub(crate) use mekf::moved as moved_state;
 pub use mfg::{MfgGnss, MfgOptions};
+pub(crate) use mixture::{combined_belief, combined_innovation};
 pub use navigation::{
-    FixReport, FixUse, NavigationError, NavigationStep, NavigationSummary, OutageReport, navigate,
+    Agreement, FixReport, FixUse, NavigationError, NavigationStep, NavigationSummary, OutageReport,
+    navigate, navigate_with,
 };
 pub use start::InitialBelief;
 pub use update::AttitudeUpdate;
@@ -74,6 +80,7 @@ impl GnssFilterKind {
             name: self.name(),
             regression: Regression::Full(correlation),
             update,
+            divided: true,
         };
         Ok(match self {
             Self::Mfgi => Box::new(MfgGnss::new(imu, full(Correlation::World), initial)?),
@@ -103,6 +110,11 @@ impl Innovation {
         } else {
             Err(FilterError::NotFinite("innovation"))
         }
+    }
+
+    /// Logarithm of the Gaussian density of the measurement, up to a constant.
+    pub(crate) fn log_likelihood(&self) -> f64 {
+        -0.5 * (self.nis + self.covariance.determinant().ln())
     }
 
     /// By what the covariance of the belief must be multiplied for the normalized innovation
@@ -145,10 +157,15 @@ pub trait GnssFilter: BayesFilter {
 
     /// The estimate alone, which is cheap.
     fn state(&self) -> NavState;
+
+    /// `S` of the attitude's matrix Fisher distribution, if the filter has one.
+    fn concentration(&self) -> Option<Vector3<f64>> {
+        None
+    }
 }
 
 /// A belief in the terms of all filters.
-fn estimate(belief: &Belief, matrix_fisher_s: Option<Vector3<f64>>) -> Estimate {
+pub(crate) fn estimate(belief: &Belief, matrix_fisher_s: Option<Vector3<f64>>) -> Estimate {
     let Belief { state, covariance } = belief;
     let part = |mean: Vector3<f64>, start: usize| {
         let covariance = covariance.fixed_view::<3, 3>(start, start).into_owned();

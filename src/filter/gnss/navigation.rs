@@ -4,9 +4,10 @@ use std::ops::ControlFlow;
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
-use super::{GnssConfig, GnssFilter, GnssFilterKind, InitialBelief, Innovation};
+use super::consistency::ConsistencyMonitor;
+use super::{Consistency, GnssConfig, GnssFilter, GnssFilterKind, InitialBelief, Innovation};
 use crate::filter::{FilterError, InertialStep};
-use crate::inertial::{Belief, Coverage, InitialAttitude, NavState, block};
+use crate::inertial::{Belief, Coverage, ImuConfig, InitialAttitude, NavState, block};
 use crate::sensor::{ImuSample, PositionFix, Stamp};
 
 /// Why a run cannot start or go on.
@@ -46,6 +47,8 @@ pub enum FixUse {
 pub struct FixReport {
     pub fate: FixUse,
     pub innovation: Innovation,
+    /// Share of the innovation's variance that is the noise of the fix.
+    pub noise_share: f64,
 }
 
 /// The belief at one time; after the update at a fix.
@@ -56,6 +59,8 @@ pub struct NavigationStep {
     /// `S` of the attitude's matrix Fisher distribution.
     pub concentration: Option<Vector3<f64>>,
     pub fix: Option<FixReport>,
+    /// What the last innovations say of the belief; `None` while there are too few.
+    pub consistency: Option<Consistency>,
 }
 
 impl NavigationStep {
@@ -99,9 +104,50 @@ pub struct NavigationSummary {
     /// Normalized innovations squared of fixes that were used, and the time of each after the
     /// first fix, s.
     pub nis: Vec<(f64, f64)>,
-    /// When the heading was first known to `start.converged_heading_sd`, s after the first fix.
+    /// When the heading was first known to `start.converged_heading_sd` by a belief that agreed with
+    /// its innovations, s after the first fix.
     pub heading_converged: Option<f64>,
+    /// Since the heading's standard deviation was first that small.
+    pub agreement: Agreement,
     pub outages: Vec<OutageReport>,
+}
+
+/// How often the belief agreed with its innovations.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Agreement {
+    pub fixes: usize,
+    /// Fixes at which the last innovations were larger, or smaller, than the belief allows for.
+    pub larger: usize,
+    pub smaller: usize,
+    /// Sums over the fixes: of the normalised innovations squared, and of the share of the
+    /// innovation's variance that is the noise of the fix.
+    nis: f64,
+    noise_share: f64,
+}
+
+impl Agreement {
+    fn add(&mut self, consistency: &Consistency, fix: &FixReport) {
+        self.fixes += 1;
+        self.larger += usize::from(consistency.overconfident());
+        self.smaller += usize::from(!consistency.holds() && !consistency.overconfident());
+        self.nis += fix.innovation.nis;
+        self.noise_share += fix.noise_share;
+    }
+
+    /// Whether the belief agreed with its innovations at most of the fixes.
+    pub fn holds(&self) -> bool {
+        2 * (self.larger + self.smaller) <= self.fixes
+    }
+
+    /// Mean of the normalised innovations squared.
+    pub fn mean_nis(&self) -> f64 {
+        self.nis / self.fixes as f64
+    }
+
+    /// Mean share of the innovation's variance that is the noise of the fix.
+    pub fn noise_share(&self) -> f64 {
+        self.noise_share / self.fixes as f64
+    }
 }
 
 /// Longest step of the propagation: its error is of second order in the turn during a step. s
@@ -116,6 +162,19 @@ pub fn navigate(
     config: &GnssConfig,
     imu: &[ImuSample],
     fixes: &[PositionFix],
+    observe: impl FnMut(&NavigationStep) -> ControlFlow<()>,
+) -> Result<NavigationSummary, NavigationError> {
+    let method = config.filter.attitude_update;
+    let start = |imu: &ImuConfig, initial: &InitialBelief| kind.start(imu, method, initial);
+    navigate_with(start, config, imu, fixes, observe)
+}
+
+/// [`navigate`] with the filter that `start` makes of what is known at the first fix.
+pub fn navigate_with(
+    start: impl FnOnce(&ImuConfig, &InitialBelief) -> Result<Box<dyn GnssFilter>, FilterError>,
+    config: &GnssConfig,
+    imu: &[ImuSample],
+    fixes: &[PositionFix],
     mut observe: impl FnMut(&NavigationStep) -> ControlFlow<()>,
 ) -> Result<NavigationSummary, NavigationError> {
     if let Some((key, expected)) = config.first_mistake() {
@@ -125,7 +184,7 @@ pub fn navigate(
     check_order("fixes", fixes.iter().map(|fix| fix.stamp))?;
     let coverage = Coverage::before_each(imu, config.imu.max_gap);
     let Start { origin, samples, coverage, fixes } = find_start(config, imu, &coverage, fixes)?;
-    let (mut run, first) = Run::start(kind, config, &origin, samples, &fixes[0])?;
+    let (mut run, first) = Run::start(start, config, &origin, samples, &fixes[0])?;
     let mut waiting = fixes[1..].iter().peekable();
     let mut now = origin;
     if observe(&first).is_break() {
@@ -219,6 +278,7 @@ struct Run<'a> {
     gate: f64,
     surprise: f64,
     coverage: Coverage,
+    monitor: ConsistencyMonitor,
     rejected_in_a_row: usize,
     last_output: Stamp,
     outages: OutageErrors,
@@ -228,7 +288,7 @@ struct Run<'a> {
 impl<'a> Run<'a> {
     /// A run that starts with a fix, and its first step.
     fn start(
-        kind: GnssFilterKind,
+        start: impl FnOnce(&ImuConfig, &InitialBelief) -> Result<Box<dyn GnssFilter>, FilterError>,
         config: &'a GnssConfig,
         origin: &ImuSample,
         samples: &[ImuSample],
@@ -236,9 +296,8 @@ impl<'a> Run<'a> {
     ) -> Result<(Self, NavigationStep), NavigationError> {
         let at = |source| NavigationError::Step { stamp: fix.stamp, source };
         let initial = initial_belief(config, origin, samples, fix)?;
-        let method = config.filter.attitude_update;
-        let mut filter = kind.start(&config.imu, method, &initial).map_err(at)?;
-        let position = config.receiver.measurement(fix.position, false);
+        let mut filter = start(&config.imu, &initial).map_err(at)?;
+        let position = config.receiver.measurement(fix, false);
         filter.update_position(&position).map_err(at)?;
         let mut run = Self {
             config,
@@ -246,6 +305,7 @@ impl<'a> Run<'a> {
             gate: config.receiver.gate(),
             surprise: config.filter.surprise(),
             coverage: Coverage::Measured,
+            monitor: ConsistencyMonitor::new(&config.consistency),
             rejected_in_a_row: 0,
             last_output: fix.stamp,
             outages: OutageErrors::default(),
@@ -286,9 +346,13 @@ impl<'a> Run<'a> {
         let at = |source| NavigationError::Step { stamp: fix.stamp, source };
         let elapsed = fix.stamp.seconds_since(self.summary.start);
         let interpolated = self.coverage == Coverage::Interpolated;
-        let position = self.config.receiver.measurement(fix.position, interpolated);
+        let position = self.config.receiver.measurement(fix, interpolated);
         let innovation = self.filter.innovation(&position).map_err(at)?;
-        let fate = if let Some(number) = self.config.outage.index_at(elapsed) {
+        let outage = self.config.outage.index_at(elapsed);
+        if outage.is_none() {
+            self.monitor.add(innovation.nis);
+        }
+        let fate = if let Some(number) = outage {
             self.outages.add(number, elapsed, &innovation);
             FixUse::Outage(number)
         } else if innovation.nis > self.gate
@@ -312,7 +376,8 @@ impl<'a> Run<'a> {
             self.summary.nis.push((elapsed, innovation.nis));
             FixUse::Used
         };
-        Ok(self.step(fix.stamp, Some(FixReport { fate, innovation })))
+        let noise_share = position.covariance.trace() / innovation.covariance.trace();
+        Ok(self.step(fix.stamp, Some(FixReport { fate, innovation, noise_share })))
     }
 
     /// The belief, if the last one is old enough.
@@ -323,15 +388,25 @@ impl<'a> Run<'a> {
 
     fn step(&mut self, stamp: Stamp, fix: Option<FixReport>) -> NavigationStep {
         self.last_output = stamp;
+        let consistency = self.monitor.verdict();
         let step = NavigationStep {
             stamp,
             belief: self.filter.belief(),
-            concentration: self.filter.estimate().matrix_fisher_s,
+            concentration: self.filter.concentration(),
             fix,
+            consistency,
         };
-        let known = step.heading_sd().to_degrees() <= self.config.start.converged_heading_sd;
-        if known && self.summary.heading_converged.is_none() {
-            self.summary.heading_converged = Some(stamp.seconds_since(self.summary.start));
+        let narrow = step.heading_sd().to_degrees() <= self.config.start.converged_heading_sd;
+        let summary = &mut self.summary;
+        if let (Some(verdict), Some(report)) = (&consistency, &fix)
+            && (narrow || summary.agreement.fixes > 0)
+            && !matches!(report.fate, FixUse::Outage(_))
+        {
+            summary.agreement.add(verdict, report);
+        }
+        let holds = consistency.is_none_or(|verdict| verdict.holds());
+        if narrow && holds && summary.heading_converged.is_none() {
+            summary.heading_converged = Some(stamp.seconds_since(summary.start));
         }
         step
     }

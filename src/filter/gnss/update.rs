@@ -155,7 +155,7 @@ impl LinearPosition {
 }
 
 /// The same regression on `R` under another marginal distribution of the attitude.
-fn with_attitude(
+pub(super) fn with_attitude(
     belief: &NavigationBelief,
     attitude: MatrixFisher,
     regression: Regression,
