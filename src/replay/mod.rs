@@ -23,7 +23,7 @@ pub use navigation::NavigationOutputs;
 pub use outputs::state_columns;
 pub use report::{Series, figures, report};
 
-use crate::config::Config;
+use crate::config::{Config, ConfigError};
 use crate::dataset::{self, Fault, Log, LogError, ReadReport};
 use crate::evaluation::{EvaluationError, Similarity, Trajectory, is_vertical, read_trajectory};
 use crate::filter::FilterKind;
@@ -46,6 +46,8 @@ pub enum ReplayError {
         "`camera.imu_from_camera` is no rigid motion (rotation and translation, row-major 4x4)"
     )]
     Extrinsics,
+    #[error(transparent)]
+    Config(#[from] ConfigError),
     #[error("{log}: no attitude: {reason}")]
     NoAttitude { log: PathBuf, reason: String },
     #[error("the front end cannot start: {0}")]
