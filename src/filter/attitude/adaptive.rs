@@ -251,14 +251,17 @@ impl AdaptiveAttitude {
             let variance = square * seconds.min(RATE_KEPT) * seconds;
             let step = InertialStep::turning(read, seconds)
                 .with_angle_covariance(Matrix3::from_diagonal_element(variance));
-            self.clipping = ClippingMonitor::default();
+            self.clipping.pass_gap();
             return Carry { step, is_gap, rate: read - bias };
         }
         let clipped = self.clipping.observe(&sample.angular_velocity, seconds);
         self.clipped_samples += u64::from(clipped.any());
         let read = sample.angular_velocity + clipped.missed / seconds;
+        if clipped.any() {
+            self.finder.doubt_turn(clipped.variance.max());
+        }
         let rate = read - bias;
-        let square = rate.norm_squared();
+        let square = (sample.angular_velocity - bias).norm_squared();
         let by_scale = self.config.attitude.gyro_scale_noise.powi(2) * square * seconds;
         let covariance = Matrix3::from_diagonal(&clipped.variance.add_scalar(by_scale));
         self.mean_square_rate +=

@@ -99,6 +99,8 @@ pub(super) struct GravityFinder {
     lasting: Vector3<f64>,
     unexpected: f64,
     error: CorrelatedError,
+    /// Variance of the direction that was found last, rad^2.
+    variance: f64,
 }
 
 impl GravityFinder {
@@ -114,7 +116,19 @@ impl GravityFinder {
             lasting: Vector3::zeros(),
             unexpected: 0.0,
             error: CorrelatedError::default(),
+            variance: 1.0,
         }
+    }
+
+    /// What was read before counts less: it was carried here with this variance.
+    pub fn doubt_turn(&mut self, variance: f64) {
+        let kept = self.variance / (self.variance + variance);
+        for low_pass in [&mut self.first, &mut self.second] {
+            low_pass.sum *= kept;
+            low_pass.weight *= kept;
+        }
+        self.filled *= kept;
+        self.error.lose(variance);
     }
 
     /// Begins to average anew; how the body accelerates is kept.
@@ -173,6 +187,7 @@ impl GravityFinder {
             + lasting * config.acceleration_time)
             / (averaged + lasting);
         let variance = averaged + lasting + carried_variance;
+        self.variance = variance;
         let concentration = self.error.added(variance, mean.seconds, correlation_time);
         Some(InertialDirection { direction, variance, concentration })
     }

@@ -171,6 +171,12 @@ impl DirectionFinder {
         self.rest.forget_motion();
     }
 
+    /// The body has turned by an angle that is known to this variance only, rad^2.
+    pub fn doubt_turn(&mut self, variance: f64) {
+        self.gravity.doubt_turn(variance);
+        self.magnetic.pass_gap(variance);
+    }
+
     /// Takes a sample whose reading of the gyroscope holds for the `seconds` before it.
     ///
     /// Numbers must be finite, `seconds` positive. The magnetic field may be in any unit and
