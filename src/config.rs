@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::dataset::{LogConfig, LogSummary};
 use crate::fault::FaultConfig;
 use crate::filter::FilterConfig;
+use crate::filter::attitude::AdaptiveConfig;
 use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
@@ -53,6 +54,9 @@ const SHIPPED: [(&str, &str); 5] = [
 
 /// The configuration of `gnss` where none is given.
 const GNSS: &str = include_str!("../configs/kitti.toml");
+
+/// The configuration of `attitude` where none is given.
+const ATTITUDE: &str = include_str!("../configs/attitude.toml");
 
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -167,6 +171,30 @@ impl GnssConfig {
     }
 }
 
+impl AdaptiveConfig {
+    /// `configs/attitude.toml`, with `overrides` (`section.key=value`).
+    pub fn shipped(overrides: &[String]) -> Result<Self, ConfigError> {
+        parse(ATTITUDE, "configs/attitude.toml", overrides)
+    }
+
+    /// Reads `path` and applies `overrides` (`section.key=value`). In a file of `replay` the
+    /// sections of images and maps are passed over.
+    pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let origin = path.display().to_string();
+        let mut table = table(&read(path)?, &origin)?;
+        let (own, of_replay) = (valid_keys::<Self>()?, valid_keys::<Config>()?);
+        let is_own = |section: &str| own.iter().any(|key| key.split('.').next() == Some(section));
+        let foreign: toml::Table = table
+            .iter()
+            .filter(|(name, _)| !is_own(name))
+            .map(|(k, v)| (k.clone(), v.clone()))
+            .collect();
+        check_keys(&foreign, &[own.clone(), of_replay].concat(), &origin)?;
+        table.retain(|section, _| is_own(section));
+        parse_table(table, &origin, overrides)
+    }
+}
+
 fn read(path: &Path) -> Result<String, ConfigError> {
     std::fs::read_to_string(path)
         .map_err(|source| ConfigError::Io { path: path.to_owned(), source })
@@ -177,9 +205,24 @@ fn parse<T>(text: &str, origin: &str, overrides: &[String]) -> Result<T, ConfigE
 where
     T: Default + Serialize + DeserializeOwned,
 {
-    let mut table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
-        ConfigError::Syntax { origin: origin.to_owned(), message: error.to_string() }
-    })?;
+    parse_table(table(text, origin)?, origin, overrides)
+}
+
+fn table(text: &str, origin: &str) -> Result<toml::Table, ConfigError> {
+    text.parse().map_err(|error: toml::de::Error| ConfigError::Syntax {
+        origin: origin.to_owned(),
+        message: error.to_string(),
+    })
+}
+
+fn parse_table<T>(
+    mut table: toml::Table,
+    origin: &str,
+    overrides: &[String],
+) -> Result<T, ConfigError>
+where
+    T: Default + Serialize + DeserializeOwned,
+{
     let valid = valid_keys::<T>()?;
     check_keys(&table, &valid, origin)?;
     for text in overrides {
@@ -293,6 +336,27 @@ mod tests {
         assert_eq!(set("imu.gyro_noise=1e-3").unwrap().imu.gyro_noise, 1e-3);
         assert_eq!(set("imu.gravity=10").unwrap().imu.gravity, 10.0);
         assert_eq!(set("log.color_topic=/my/image").unwrap().log.color_topic, "/my/image");
+    }
+
+    #[test]
+    fn the_shipped_file_of_attitude_holds_the_defaults_and_shares_the_imu_with_replay() {
+        assert_eq!(AdaptiveConfig::shipped(&[]).unwrap(), AdaptiveConfig::default());
+        let given = flat_keys(&ATTITUDE.parse().unwrap());
+        assert_eq!(given.len(), valid_keys::<AdaptiveConfig>().unwrap().len(), "{given:?}");
+
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("both.toml");
+        std::fs::write(&path, shipped_text("vcu_rvi").unwrap()).unwrap();
+        let shared = AdaptiveConfig::load(&path, &["rest.reading_sd=1e-3".to_owned()]).unwrap();
+        assert_eq!(shared.imu, Config::shipped("vcu_rvi", &[]).unwrap().imu);
+        assert_eq!(shared.rest.reading_sd, 1e-3);
+        for (text, key) in
+            [("[camera]\nfy_ = 1.0", "camera.fy_"), ("[magnetic]\nnoize = 1", "magnetic.noize")]
+        {
+            std::fs::write(&path, text).unwrap();
+            let message = AdaptiveConfig::load(&path, &[]).unwrap_err().to_string();
+            assert!(message.contains(&format!("unknown key `{key}`; did you mean")), "{message}");
+        }
     }
 
     #[test]

@@ -1,16 +1,17 @@
 use std::path::PathBuf;
 
 use super::terminal::{INTERRUPTED, catch_interrupts, progress};
-use mfg_vio::filter::attitude::{AdaptiveConfig, AttitudeFilterKind};
+use mfg_vio::filter::attitude::AttitudeFilterKind;
 use mfg_vio::replay::{AttitudeMetrics, AttitudeRequest, replay_attitude};
 
 /// Estimate attitude and gyro bias from an IMU and a magnetometer.
 ///
 /// The log is CSV with the columns t,gx,gy,gz,ax,ay,az[,mx,my,mz] (s, rad/s, m/s^2; the magnetic
 /// field in any unit), MCAP or a ROS 1 bag with an IMU. World z is up and y is magnetic north;
-/// without a magnetometer the heading is arbitrary. With --out the directory receives
-/// attitude.csv: time, quaternion (world_from_body), gyro bias (rad/s) and the singular values s1
-/// s2 s3 of the matrix Fisher parameter, one line a sample.
+/// without a magnetometer the heading counts from where it began. With --out the directory receives
+/// attitude.csv: time, quaternion (world_from_body), gyro bias (rad/s), the singular values s1 s2 s3
+/// of the matrix Fisher parameter and the covariance of the body-frame rotation vector (rad^2), one
+/// line a sample.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  mfg-vio attitude imu.csv --filter mfgba --out runs/attitude")]
 pub struct AttitudeArgs {
@@ -19,6 +20,16 @@ pub struct AttitudeArgs {
     /// mfgia, mfgiu, mfgba, mfgbu, fnf-r, fnf-l, bf-mfd, bf-amfd, uae, mekf, iekf or ukf.
     #[arg(long, value_name = "NAME", default_value_t = AttitudeFilterKind::Mfgba)]
     filter: AttitudeFilterKind,
+    /// Configuration of the sensors; a file of `replay` serves as well, for its section [imu]
+    /// [default: configs/attitude.toml, units by the log's layout].
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Override a key of the configuration, e.g. --set imu.gyro_bias_sd=0.01 (repeatable).
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Topic of the IMU [default: chosen by message type].
+    #[arg(long, value_name = "TOPIC")]
+    topic: Option<String>,
     /// Directory for attitude.csv.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -32,7 +43,9 @@ pub fn run(args: &AttitudeArgs) -> anyhow::Result<()> {
     let request = AttitudeRequest {
         log: args.log.clone(),
         filter: args.filter,
-        config: AdaptiveConfig::default(),
+        config: args.config.clone(),
+        overrides: args.overrides.clone(),
+        topic: args.topic.clone(),
         out: args.out.clone(),
         stop: &INTERRUPTED,
     };
@@ -63,12 +76,22 @@ fn print_summary(m: &AttitudeMetrics) {
         m.step_time_ns * 1e-3
     );
     println!(
-        "at rest {:.1} s, magnetically disturbed {:.1} s, failed steps {}{}",
+        "in gaps {:.1} s, at rest {:.1} s, magnetically disturbed {:.1} s, failed steps {}{}",
+        m.gap_seconds,
         m.rest_seconds,
         m.disturbed_seconds,
         m.failed_steps,
         if m.interrupted { ", interrupted" } else { "" }
     );
+    if let Some(limit) = m.gyro_limit {
+        println!(
+            "gyroscope at the end of its range ({:.2} rad/s, {:.0} deg/s) in {} samples, which are \
+             taken for uncertain",
+            limit,
+            limit.to_degrees(),
+            m.clipped_samples
+        );
+    }
     if let Some(last) = &m.last {
         println!("at {:.3} s: quaternion (x y z w) {:.6?}", last.time, last.quaternion);
         println!("  standard deviation {:.3?} deg", last.rotation_sd_deg);

@@ -185,6 +185,7 @@ impl Scene {
                         + accel_bias
                         + normal(rng, imu.accel_noise * white),
                 ),
+                angle_covariance: Matrix3::zeros(),
             });
             gyro_bias += normal(rng, imu.gyro_bias_walk * STEP.sqrt());
             accel_bias += normal(rng, imu.accel_bias_walk * STEP.sqrt());

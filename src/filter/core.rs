@@ -86,12 +86,26 @@ pub struct InertialStep {
     /// Specific force `R^T (a - g)` in body coordinates, m/s^2; pure attitude filters do not look
     /// at it.
     pub specific_force: Option<Vector3<f64>>,
+    /// Covariance of the angle over the interval beyond the noise that the filter knows of its
+    /// gyroscope, rad^2, in the frame of the angular velocity: what a gap or a clipped reading
+    /// leaves open.
+    pub angle_covariance: Matrix3<f64>,
 }
 
 impl InertialStep {
     /// An interval of which only the angular velocity is known.
     pub fn turning(angular_velocity: Vector3<f64>, seconds: f64) -> Self {
-        Self { seconds, angular_velocity, specific_force: None }
+        Self {
+            seconds,
+            angular_velocity,
+            specific_force: None,
+            angle_covariance: Matrix3::zeros(),
+        }
+    }
+
+    /// The same interval with an angle that is known less well.
+    pub fn with_angle_covariance(self, angle_covariance: Matrix3<f64>) -> Self {
+        Self { angle_covariance, ..self }
     }
 
     /// The interval between two samples, with the averages of both ends.
@@ -114,6 +128,7 @@ impl InertialStep {
             return Err(FilterError::Interval(self.seconds));
         }
         finite("angular velocity", self.angular_velocity.as_slice())?;
+        finite("angle covariance", self.angle_covariance.as_slice())?;
         self.specific_force.map_or(Ok(()), |f| finite("specific force", f.as_slice()))
     }
 }

@@ -1,6 +1,7 @@
 //! Noise and biases of the IMU, and how a belief about the motion of the body is carried through
 //! the kinematics.
 
+mod clipping;
 mod coverage;
 mod directions;
 mod imu;
@@ -9,9 +10,10 @@ mod noise;
 mod propagation;
 mod state;
 
+pub use clipping::{Clipped, ClippingMonitor};
 pub use coverage::Coverage;
 pub use directions::{
-    BodyDirection, DirectionConfig, DirectionFinder, Directions, GravityConfig, MagneticConfig,
+    BodyDirection, DirectionConfig, DirectionFinder, Directions, GravityConfig, MagneticConfig, Prediction,
     RestConfig,
 };
 pub use imu::ImuConfig;

@@ -9,17 +9,22 @@ use serde::Serialize;
 use super::ReplayError;
 use super::outputs::OutputFile;
 use crate::config::Config;
-use crate::dataset::{self, ImuCsv, ImuRow, Log, LogConfig, LogError};
+use crate::dataset::{self, ImuCsv, ImuRow, Log, LogConfig, LogError, LogSummary};
 use crate::distribution::matrix_fisher::MatrixFisher;
-use crate::filter::Estimate;
 use crate::filter::attitude::{AdaptiveAttitude, AdaptiveConfig, AttitudeFilterKind, AttitudeStep};
+use crate::filter::{Estimate, FilterError};
 use crate::sensor::{Event, Stamp};
 
 /// What is asked for.
 pub struct AttitudeRequest<'a> {
     pub log: PathBuf,
     pub filter: AttitudeFilterKind,
-    pub config: AdaptiveConfig,
+    /// Configuration file [default: `configs/attitude.toml`, units by the log's layout].
+    pub config: Option<PathBuf>,
+    /// `section.key=value`.
+    pub overrides: Vec<String>,
+    /// Of the IMU; `None`: chosen by message type.
+    pub topic: Option<String>,
     /// Directory for `attitude.csv`.
     pub out: Option<PathBuf>,
     pub stop: &'a AtomicBool,
@@ -35,8 +40,12 @@ pub struct AttitudeMetrics {
     pub magnetic_samples: u64,
     /// Samples left out: not finite, or not later than the one before.
     pub refused: u64,
-    /// Gaps after which the attitude was sought anew.
+    /// Gaps in the data, and the time in them, s.
     pub gaps: u64,
+    pub gap_seconds: f64,
+    /// Samples in which an axis of the gyroscope was at the end of its range, and that end, rad/s.
+    pub clipped_samples: u64,
+    pub gyro_limit: Option<f64>,
     /// Steps that the filter could not take, after which its belief was what it had been.
     pub failed_steps: u64,
     /// Lines of `attitude.csv`.
@@ -62,6 +71,8 @@ pub struct Reached {
     pub quaternion: [f64; 4],
     /// Standard deviation of the body-frame rotation vector, degrees.
     pub rotation_sd_deg: [f64; 3],
+    /// Upper triangle of its covariance, row by row, rad^2.
+    pub rotation_covariance: [f64; 6],
     /// rad/s.
     pub gyro_bias: [f64; 3],
     /// Proper singular values of the matrix Fisher parameter.
@@ -77,12 +88,15 @@ impl Reached {
             let fisher = MatrixFisher::from_mode_and_information(mode, information).ok()?;
             Some(fisher.svd().s)
         })?;
-        let variance = estimate.rotation_covariance.diagonal();
+        let p = estimate.rotation_covariance;
+        let variance = p.diagonal();
+        let upper = [p[(0, 0)], p[(0, 1)], p[(0, 2)], p[(1, 1)], p[(1, 2)], p[(2, 2)]];
         let quaternion = nalgebra::UnitQuaternion::from_rotation_matrix(&estimate.world_from_body);
         Some(Self {
             time: stamp.seconds(),
             quaternion: quaternion.coords.into(),
             rotation_sd_deg: variance.map(|v| v.sqrt().to_degrees()).into(),
+            rotation_covariance: upper,
             gyro_bias: estimate.gyro_bias?.mean.into(),
             s: s.into(),
         })
@@ -91,13 +105,16 @@ impl Reached {
     fn line(&self, stamp: Stamp) -> String {
         let [q, b, s] = [&self.quaternion[..], &self.gyro_bias, &self.s];
         let fixed = q.iter().map(|x| format!("{x:.9}"));
-        let floating = b.iter().chain(s).map(|x| format!("{x:.9e}"));
+        let floating =
+            b.iter().chain(s).chain(&self.rotation_covariance).map(|x| format!("{x:.9e}"));
         let fields: Vec<String> = fixed.chain(floating).collect();
         format!("{stamp},{}", fields.join(","))
     }
 }
 
-const COLUMNS: &str = "time,qx,qy,qz,qw,gyro_bias_x,gyro_bias_y,gyro_bias_z,s1,s2,s3";
+const COLUMNS: &str = "time,qx,qy,qz,qw,gyro_bias_x,gyro_bias_y,gyro_bias_z,s1,s2,s3,\
+                       rotation_cov_xx,rotation_cov_xy,rotation_cov_xz,rotation_cov_yy,\
+                       rotation_cov_yz,rotation_cov_zz";
 
 /// Runs a filter over a log. `attitude.csv` is valid whenever this returns, also when it was
 /// stopped.
@@ -108,14 +125,14 @@ pub fn replay_attitude(
     request: &AttitudeRequest,
     mut progress: impl FnMut(),
 ) -> Result<AttitudeMetrics, ReplayError> {
-    let rows = rows(&request.log)?;
+    let (rows, config) = open(request)?;
     let mut output = request.out.as_deref().map(create).transpose()?;
     let mut metrics = AttitudeMetrics {
         log: request.log.display().to_string(),
         filter: request.filter.to_string(),
         ..AttitudeMetrics::default()
     };
-    let mut estimator = AdaptiveAttitude::new(request.filter, &request.config);
+    let mut estimator = AdaptiveAttitude::new(request.filter, &config);
     let (clock, mut stepping) = (Instant::now(), Duration::ZERO);
     let mut span: Option<(Stamp, Stamp)> = None;
     let mut reached = None;
@@ -135,7 +152,7 @@ pub fn replay_attitude(
         let before = Instant::now();
         let step = estimator.step(&row.imu, row.magnetic_field.as_ref());
         stepping += before.elapsed();
-        metrics.count(&row, &step, request.config.directions.interval);
+        metrics.count(&row, &step);
         progress();
         if matches!(step, Ok(AttitudeStep::Refused)) {
             continue;
@@ -151,6 +168,8 @@ pub fn replay_attitude(
         reached = Some(now);
     }
     finish(output)?;
+    metrics.clipped_samples = estimator.clipped_samples();
+    metrics.gyro_limit = estimator.gyro_limit();
     metrics.log_seconds = span.map_or(0.0, |(first, last)| last.seconds_since(first));
     metrics.wall_seconds = clock.elapsed().as_secs_f64();
     metrics.step_time_ns = stepping.as_secs_f64() * 1e9 / metrics.samples.max(1) as f64;
@@ -160,13 +179,9 @@ pub fn replay_attitude(
             log: request.log.clone(),
             reason: format!(
                 "{} samples over {:.3} s, {} of them refused (not finite, or not later than the \
-                 one before), {} steps failed; accelerometer readings in m/s^2 over {} s without a \
+                 one before), {} steps failed; accelerometer readings in m/s^2 over 0.1 s without a \
                  gap are needed",
-                metrics.samples,
-                metrics.log_seconds,
-                metrics.refused,
-                metrics.failed_steps,
-                request.config.directions.interval
+                metrics.samples, metrics.log_seconds, metrics.refused, metrics.failed_steps,
             ),
         });
     }
@@ -174,22 +189,20 @@ pub fn replay_attitude(
 }
 
 impl AttitudeMetrics {
-    fn count(
-        &mut self,
-        row: &ImuRow,
-        step: &Result<AttitudeStep, crate::filter::FilterError>,
-        interval: f64,
-    ) {
+    fn count(&mut self, row: &ImuRow, step: &Result<AttitudeStep, FilterError>) {
         self.samples += 1;
         self.magnetic_samples += u64::from(row.magnetic_field.is_some());
         match step {
             Ok(AttitudeStep::Refused) => self.refused += 1,
-            Ok(AttitudeStep::Started) => self.gaps += u64::from(self.samples > 1),
-            Ok(AttitudeStep::Propagated) => {}
+            Ok(AttitudeStep::Gap(seconds)) => {
+                self.gaps += 1;
+                self.gap_seconds += seconds;
+            }
+            Ok(AttitudeStep::Started | AttitudeStep::Propagated) => {}
             Ok(AttitudeStep::Updated(directions)) => {
-                self.rest_seconds +=
-                    interval * f64::from(u8::from(directions.resting_rate.is_some()));
-                self.disturbed_seconds += interval * f64::from(u8::from(directions.disturbed));
+                let if_so = |so: bool| if so { directions.seconds } else { 0.0 };
+                self.rest_seconds += if_so(directions.resting_rate.is_some());
+                self.disturbed_seconds += if_so(directions.disturbed);
             }
             Err(error) => {
                 self.failed_steps += 1;
@@ -216,30 +229,56 @@ fn finish(output: Option<OutputFile>) -> Result<(), ReplayError> {
 
 type Rows = Box<dyn Iterator<Item = Result<ImuRow, LogError>>>;
 
-/// The samples of a log of images and IMU, or else of a CSV file.
-fn rows(path: &Path) -> Result<Rows, ReplayError> {
+/// The samples of a log of images and IMU, or else of a CSV file, in SI units, and the settings.
+fn open(request: &AttitudeRequest) -> Result<(Rows, AdaptiveConfig), ReplayError> {
+    let path = &request.log;
     let summary = match dataset::detect(path) {
-        Ok(summary) => summary,
-        Err(LogError::UnknownFormat { .. }) if path.is_file() => {
-            return Ok(Box::new(ImuCsv::open(path)?));
-        }
+        Ok(summary) => Some(summary),
+        Err(LogError::UnknownFormat { .. }) if path.is_file() => None,
         Err(error) => return Err(error.into()),
     };
-    let name = &summary.config_name;
-    let config = Config::shipped(name, &[]).map_err(|error| ReplayError::NoAttitude {
-        log: path.to_owned(),
-        reason: error.to_string(),
-    })?;
-    let none = || "none".to_owned();
-    let imu_only =
-        LogConfig { color_topic: none(), depth_topic: none(), truth_topic: none(), ..config.log };
+    let config = configuration(request, summary.as_ref())?;
+    let Some(summary) = summary else {
+        let imu = config.imu.clone();
+        let rows = ImuCsv::open(path)?
+            .map(move |row| row.map(|row| ImuRow { imu: imu.in_si_units(&row.imu), ..row }));
+        return Ok((Box::new(rows), config));
+    };
     if !summary.has_imu {
         let available = summary.sources.values().cloned().collect::<Vec<_>>().join(", ");
         let role = "IMU";
         return Err(LogError::MissingStream { path: path.to_owned(), role, available }.into());
     }
-    tracing::info!("{}: IMU in the units of the shipped configuration `{name}`", summary.kind);
-    Ok(Box::new(ImuOfLog(dataset::open(path, &imu_only, &config.imu)?)))
+    let none = || "none".to_owned();
+    let imu_only = LogConfig {
+        color_topic: none(),
+        depth_topic: none(),
+        truth_topic: none(),
+        imu_topic: request.topic.clone().unwrap_or_default(),
+        ..LogConfig::default()
+    };
+    let log = dataset::open(path, &imu_only, &config.imu)?;
+    Ok((Box::new(ImuOfLog(log)), config))
+}
+
+/// That of the file, or the shipped one in the units of the log's layout.
+fn configuration(
+    request: &AttitudeRequest,
+    summary: Option<&LogSummary>,
+) -> Result<AdaptiveConfig, ReplayError> {
+    if let Some(path) = &request.config {
+        return Ok(AdaptiveConfig::load(path, &request.overrides)?);
+    }
+    let mut overrides = Vec::new();
+    if let Some(summary) = summary {
+        let name = &summary.config_name;
+        let imu = Config::shipped(name, &[])?.imu;
+        overrides.push(format!("imu.accelerometer_scale={}", imu.accelerometer_scale));
+        overrides.push(format!("imu.gyroscope_scale={}", imu.gyroscope_scale));
+        tracing::info!("{}: IMU in the units of the shipped configuration `{name}`", summary.kind);
+    }
+    overrides.extend(request.overrides.iter().cloned());
+    Ok(AdaptiveConfig::shipped(&overrides)?)
 }
 
 struct ImuOfLog(Box<dyn Log>);

@@ -1,5 +1,6 @@
 use std::path::PathBuf;
 
+use crate::config::ConfigError;
 use crate::dataset::LogError;
 use crate::evaluation::EvaluationError;
 
@@ -16,6 +17,8 @@ pub enum ReplayError {
         "`camera.imu_from_camera` is no rigid motion (rotation and translation, row-major 4x4)"
     )]
     Extrinsics,
+    #[error(transparent)]
+    Config(#[from] ConfigError),
     #[error("{log}: no attitude: {reason}")]
     NoAttitude { log: PathBuf, reason: String },
     #[error("the front end cannot start: {0}")]

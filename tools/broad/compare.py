@@ -68,7 +68,9 @@ def ours(binary, name, trial):
         if run.returncode != 0:
             sys.exit(f"{name} on {trial.name}: {run.stderr.strip()}")
         summary = json.loads(run.stdout)
-        table = np.loadtxt(pathlib.Path(folder) / "attitude.csv", delimiter=",", skiprows=1)
+        table = np.loadtxt(
+            pathlib.Path(folder) / "attitude.csv", delimiter=",", skiprows=1, usecols=range(5)
+        )
     estimate = np.full((len(trial.time), 4), np.nan)
     rows = np.rint(table[:, 0] * trial.rate).astype(int)
     estimate[rows] = table[:, [4, 1, 2, 3]]
@@ -83,12 +85,14 @@ def ours(binary, name, trial):
     return estimate
 
 
-def rival(name, trial):
-    gyr, acc, mag = (np.ascontiguousarray(a) for a in (trial.gyr, trial.acc, trial.mag))
+def rival(name, gyr, acc, mag, rate):
+    """Estimates (w, x, y, z) of another package's filter; without a magnetometer `mag` is None."""
+    readings = {"gyr": gyr, "acc": acc, "mag": mag}
+    readings = {k: np.ascontiguousarray(a) for k, a in readings.items() if a is not None}
     if name == "vqf":
-        return vqf.VQF(1 / trial.rate).updateBatch(gyr, acc, mag)["quat9D"]
-    kind = getattr(ahrs.filters, name)
-    return kind(gyr=gyr, acc=acc, mag=mag, frequency=trial.rate).Q
+        found = vqf.VQF(1 / rate).updateBatch(*readings.values())
+        return found["quat6D" if mag is None else "quat9D"]
+    return getattr(ahrs.filters, name)(frequency=rate, **readings).Q
 
 
 def main():
@@ -111,7 +115,9 @@ def main():
     for path in paths:
         trial = broad.read(path)
         estimates = {name: ours(arguments.binary, name, trial) for name in names}
-        estimates |= {name: rival(name, trial) for name in RIVALS}
+        estimates |= {
+            name: rival(name, trial.gyr, trial.acc, trial.mag, trial.rate) for name in RIVALS
+        }
         for name, estimate in estimates.items():
             row = {"trial": trial.name, "filter": name}
             results.append(row | dict(zip(PARTS, errors(estimate, trial))))

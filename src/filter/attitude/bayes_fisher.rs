@@ -133,8 +133,8 @@ impl BayesFilter for BayesFisher {
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
         let turn = exp(&(step.angular_velocity * step.seconds));
-        let q = || self.gyro.noise * step.seconds;
-        let mean = match (self.gyro.isotropic_variance(step.seconds), self.gyro.frame) {
+        let q = || self.gyro.angle_covariance(step);
+        let mean = match (self.gyro.isotropic_variance(step), self.gyro.frame) {
             (Some(variance), _) => self.mean.diffused(variance),
             (None, Frame::Body) => self.mean.polar().diffused_in_body(&q())?.principal(),
             (None, Frame::World) => self.mean.polar().diffused_in_world(&q())?.principal(),

@@ -78,11 +78,11 @@ impl FastNonlinear {
     }
 
     /// The covariance after a turn by which the attitude becomes `next`, and the noise of it.
-    fn propagated(&self, next: &Rotation3<f64>, seconds: f64) -> Matrix3<f64> {
-        if let Some(variance) = self.gyro.isotropic_variance(seconds) {
+    fn propagated(&self, next: &Rotation3<f64>, step: &InertialStep) -> Matrix3<f64> {
+        if let Some(variance) = self.gyro.isotropic_variance(step) {
             return self.covariance + Matrix3::from_diagonal_element(variance);
         }
-        let q = self.gyro.noise * seconds;
+        let q = self.gyro.angle_covariance(step);
         let entered = if self.error == self.gyro.frame { next } else { &self.mode };
         self.covariance
             + match self.gyro.frame {
@@ -178,7 +178,7 @@ impl BayesFilter for FastNonlinear {
             Frame::Body => self.mode * turn,
             Frame::World => turn * self.mode,
         };
-        self.covariance = self.propagated(&next, step.seconds);
+        self.covariance = self.propagated(&next, step);
         self.mode = next;
         Ok(())
     }

@@ -142,14 +142,13 @@ impl BayesFilter for AttitudeMekf {
         let angle = (step.angular_velocity - *bias) * h;
         let turn = exp(&angle);
         // Body: e+ = E^T e - h J_r b - n. World: e+ = e - R (h J_l b + E n).
+        let noise = self.gyro.angle_covariance(step);
         let (by_error, by_bias, q) = match error {
-            Frame::Body => {
-                (turn.inverse().into_inner(), right_jacobian(&angle) * -h, self.gyro.noise * h)
-            }
+            Frame::Body => (turn.inverse().into_inner(), right_jacobian(&angle) * -h, noise),
             Frame::World => (
                 Matrix3::identity(),
                 attitude.matrix() * left_jacobian(&angle) * -h,
-                conjugated(&(*attitude * turn), &(self.gyro.noise * h)),
+                conjugated(&(*attitude * turn), &noise),
             ),
         };
         let mut transition = Matrix6::identity();

@@ -141,7 +141,7 @@ impl BayesFilter for InvariantKalman {
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
         let turn = exp(&(step.angular_velocity * step.seconds));
-        let q = self.gyro.noise * step.seconds;
+        let q = self.gyro.angle_covariance(step);
         let frames = (self.error, self.gyro.frame);
         self.covariance =
             propagated_covariance(&self.covariance, frames, &self.attitude, &turn, &q);

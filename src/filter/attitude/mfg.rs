@@ -115,7 +115,7 @@ impl AttitudeMfg {
     /// Table 4.4.
     fn propagated_points(&self, step: &InertialStep) -> Result<Belief, FilterError> {
         let h = step.seconds;
-        let factor = (self.gyro.noise * h).cholesky();
+        let factor = self.gyro.angle_covariance(step).cholesky();
         let spread = factor.map_or_else(Matrix3::zeros, |factor| factor.l() * 3f64.sqrt());
         let points = self.belief.sigma_points(ATTITUDE_WEIGHT, BIAS_WEIGHT)?;
         let back = self.belief.attitude().mode().inverse();

@@ -75,7 +75,7 @@ pub(super) fn propagate(
     // In principal axes d = slope v_R + noise, noise ~ N(0, scatter).
     let to_axes = v.matrix().transpose() * jacobian;
     let slope = to_axes * p * -h;
-    let scatter = to_axes * (gyro.noise * h + sigma_c * (h * h)) * to_axes.transpose();
+    let scatter = to_axes * (gyro.angle_covariance(step) + sigma_c * (h * h)) * to_axes.transpose();
     let loss = 0.5 * (Matrix3::from_diagonal_element(scatter.trace()) - scatter);
 
     // d = by_r^T r + noise, and what its mean makes of the moments: E[d_l r r^T].

@@ -46,11 +46,11 @@ use std::str::FromStr;
 
 use nalgebra::{Matrix3, Rotation3, SymmetricEigen, Vector3};
 
-use super::core::{BayesFilter, FilterError, Frame, finite};
+use super::core::{BayesFilter, FilterError, Frame, InertialStep, finite};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::distribution::matrix_fisher_gaussian::Correlation;
 
-pub use adaptive::{AdaptiveAttitude, AdaptiveConfig, AttitudeStep};
+pub use adaptive::{AdaptiveAttitude, AdaptiveConfig, AttitudeStep, CarryingConfig};
 pub use bayes_fisher::{BayesFisher, MomentMap};
 pub use fast::FastNonlinear;
 pub use gaussian::AttitudeMekf;
@@ -90,10 +90,16 @@ impl GyroModel {
         finite("gyro bias walk", self.bias_walk.as_slice())
     }
 
-    /// The variance of the angle over `seconds`, if it is the same about every axis.
-    fn isotropic_variance(&self, seconds: f64) -> Option<f64> {
-        let variance = self.noise[(0, 0)];
-        (self.noise == Matrix3::from_diagonal_element(variance)).then_some(variance * seconds)
+    /// The covariance of the angle over a step.
+    fn angle_covariance(&self, step: &InertialStep) -> Matrix3<f64> {
+        self.noise * step.seconds + step.angle_covariance
+    }
+
+    /// The variance of the angle over a step, if it is the same about every axis.
+    fn isotropic_variance(&self, step: &InertialStep) -> Option<f64> {
+        let covariance = self.angle_covariance(step);
+        let variance = covariance[(0, 0)];
+        (covariance == Matrix3::from_diagonal_element(variance)).then_some(variance)
     }
 }
 

@@ -91,7 +91,7 @@ impl BayesFilter for AttitudeUkf {
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
         let h = step.seconds;
-        let half = joint_covariance(&(self.gyro.noise * (0.5 * h)), &Matrix3::zeros());
+        let half = joint_covariance(&(self.gyro.angle_covariance(step) * 0.5), &Matrix3::zeros());
         let deviations = self.deviations(&(self.belief.covariance + half))?;
         let turned = |d: &Vector6<f64>| {
             let rate = step.angular_velocity - self.belief.bias - d.fixed_rows::<3>(3);

@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 
 use super::consistency::ConsistencyMonitor;
 use super::{Consistency, GnssConfig, GnssFilter, GnssFilterKind, InitialBelief, Innovation};
@@ -332,6 +332,7 @@ impl<'a> Run<'a> {
             seconds: seconds / steps,
             angular_velocity: (from.angular_velocity + to.angular_velocity) * 0.5,
             specific_force: Some((from.specific_force + to.specific_force) * 0.5),
+            angle_covariance: Matrix3::zeros(),
         };
         for _ in 0..steps as usize {
             self.filter

@@ -84,6 +84,7 @@ fn step() -> InertialStep {
         seconds: 0.01,
         angular_velocity: Vector3::new(0.2, -0.1, 0.4),
         specific_force: Some(Vector3::new(0.5, -0.3, 9.9)),
+        angle_covariance: Matrix3::zeros(),
     }
 }
 

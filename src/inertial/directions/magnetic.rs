@@ -1,23 +1,30 @@
 //! North from the magnetic field, with the iron of the device told apart from it.
 
-use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector3};
+use serde::{Deserialize, Serialize};
 
-use super::{CorrelatedNoise, InertialDirection, Interval};
+use super::{CorrelatedError, InertialDirection, Interval};
 
 /// How far the magnetometer is believed to show north. Fields are relative to the magnitude of
 /// the first one measured.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct MagneticConfig {
     /// Standard deviation of what varies in the field from place to place and is not modelled.
     pub noise: f64,
     /// Its correlation time, s.
     pub noise_correlation_time: f64,
-    /// Random walk of the field in inertial coordinates, which also drift, 1/sqrt(s).
+    /// Random walk of the field in inertial coordinates, which also drift, 1/sqrt(s). What is not
+    /// known of the gyroscope's bias is added.
     pub field_walk: f64,
     /// Standard deviation of the iron that calibration has left.
     pub iron_sd: f64,
-    /// Random walk of the iron, 1/sqrt(s). It also stands for soft iron, which is not modelled.
+    /// Random walk of the iron, 1/sqrt(rad): soft iron, which is not modelled, looks like iron that
+    /// changes as the body turns. While it does not turn, iron cannot be told from the field, and
+    /// does not change.
     pub iron_walk: f64,
+    /// Turn from which on the soft iron looks like another, rad.
+    pub iron_turn: f64,
     /// Standard deviation of the iron when some has come or gone.
     pub new_iron_sd: f64,
     /// Standard deviation of the delay of the magnetometer behind the gyroscope, s.
@@ -42,11 +49,12 @@ pub struct MagneticConfig {
 impl Default for MagneticConfig {
     fn default() -> Self {
         Self {
-            noise: 0.02,
+            noise: 0.03,
             noise_correlation_time: 3.0,
-            field_walk: 2e-3,
+            field_walk: 1e-3,
             iron_sd: 0.02,
-            iron_walk: 3e-3,
+            iron_walk: 7e-3,
+            iron_turn: 0.5,
             new_iron_sd: 2.0,
             delay_sd: 0.01,
             disturbed_above: 25.0,
@@ -54,7 +62,7 @@ impl Default for MagneticConfig {
             calm_time: 1.0,
             patience: 20.0,
             heading_sd: 3f64.to_radians(),
-            heading_correlation_time: 20.0,
+            heading_correlation_time: 8.0,
             disturbed_factor: 10.0,
         }
     }
@@ -63,6 +71,10 @@ impl Default for MagneticConfig {
 /// Field (0 to 2), iron (3 to 5), delay (6).
 type State = SVector<f64, 7>;
 type Covariance = SMatrix<f64, 7, 7>;
+
+/// An unknown bias turns the field steadily; to the filter, which follows within this time, it is a
+/// random walk, s.
+const BIAS_MEMORY: f64 = 1.0;
 
 const FIELD: usize = 0;
 const IRON: usize = 3;
@@ -77,8 +89,10 @@ pub(super) struct MagneticFinder {
     magnitude: f64,
     state: State,
     covariance: Covariance,
-    field_noise: CorrelatedNoise,
-    heading_noise: CorrelatedNoise,
+    field_error: CorrelatedError,
+    heading_error: CorrelatedError,
+    /// `inertial_from_body` when the soft iron was last another.
+    iron_attitude: Rotation3<f64>,
     disturbed: bool,
     /// Time since the reading was last far from the expected one, s.
     calm: f64,
@@ -96,8 +110,9 @@ impl MagneticFinder {
             magnitude: 0.0,
             state: State::zeros(),
             covariance,
-            field_noise: CorrelatedNoise::default(),
-            heading_noise: CorrelatedNoise::default(),
+            field_error: CorrelatedError::default(),
+            heading_error: CorrelatedError::default(),
+            iron_attitude: Rotation3::identity(),
             disturbed: false,
             calm: 0.0,
             unexplained: 0.0,
@@ -112,19 +127,27 @@ impl MagneticFinder {
         self.state.fixed_rows::<3>(IRON) * self.magnitude
     }
 
-    /// The field may be anything; iron and delay are kept.
-    pub fn forget_field(&mut self) {
-        // Wide beside any field, so that the first reading decides.
-        forget_block(&mut self.covariance, FIELD, 100.0);
-        self.field_noise = CorrelatedNoise::default();
-        self.heading_noise = CorrelatedNoise::default();
+    /// The body has turned by an angle that is known to this variance, rad^2: so has the field.
+    pub fn pass_gap(&mut self, variance: f64) {
+        for i in 0..3 {
+            self.covariance[(FIELD + i, FIELD + i)] += variance;
+        }
+        self.heading_error.lose(variance);
     }
 
-    /// Horizontal direction towards north, given the vertical one.
-    pub fn measure(&mut self, mean: &Interval, up: &Vector3<f64>) -> Option<InertialDirection> {
+    /// Horizontal direction towards north, given the vertical one and the variance of the
+    /// gyroscope's bias, rad^2/s^2.
+    pub fn measure(
+        &mut self,
+        mean: &Interval,
+        up: &InertialDirection,
+        inertial_from_body: &Rotation3<f64>,
+        bias_variance: f64,
+    ) -> Option<InertialDirection> {
         if self.magnitude == 0.0 {
             self.magnitude = mean.inertial_field.norm();
-            self.forget_field();
+            // Wide beside any field, so that the first reading decides.
+            forget_block(&mut self.covariance, FIELD, 100.0);
         }
         // A sensor that reads nothing shows no direction.
         if self.magnitude == 0.0 {
@@ -132,41 +155,62 @@ impl MagneticFinder {
         }
         let reading = mean.inertial_field / self.magnitude;
         let field_rate = mean.field_rate / self.magnitude;
-        let noise = self.take_in(&reading, &field_rate, &mean.turn, mean.seconds)?;
+        self.let_time_pass(mean.seconds, inertial_from_body, bias_variance);
+        self.take_in(&reading, &field_rate, &mean.turn, mean.seconds)?;
 
         let iron = self.state.fixed_rows::<3>(IRON).into_owned();
         let field = reading - mean.turn * iron - field_rate * self.state[DELAY];
-        let horizontal = field - up * field.dot(up);
+        let vertical = field.dot(&up.direction);
+        let horizontal = field - up.direction * vertical;
         let length = horizontal.norm();
         let direction = horizontal.try_normalize(1e-6)?;
-        let east = direction.cross(up);
+        let east = direction.cross(&up.direction);
         let iron_covariance = self.covariance.fixed_view::<3, 3>(IRON, IRON);
         let iron_along_east = mean.turn.transpose() * east;
-        let across = (iron_along_east.transpose() * iron_covariance * iron_along_east)[0] + noise;
         let config = &self.config;
+        let across = (iron_along_east.transpose() * iron_covariance * iron_along_east)[0]
+            + config.noise.powi(2);
         let mut variance = across / length.powi(2) + config.heading_sd.powi(2);
         if self.disturbed {
             variance *= config.disturbed_factor.powi(2);
         }
+        // A tilt moves the vertical part of the field into the horizontal plane.
+        variance += up.variance * (vertical / length).powi(2);
         let correlation_time = config.heading_correlation_time;
-        let variance = self.heading_noise.variance(variance, mean.seconds, correlation_time);
-        Some(InertialDirection { direction, concentration: variance.recip() })
+        let concentration = self.heading_error.added(variance, mean.seconds, correlation_time);
+        Some(InertialDirection { direction, variance, concentration })
     }
 
-    /// One step of the Kalman filter; returns the variance of the reading per axis.
+    /// The field drifts with the gyroscope, and soft iron becomes another as the body turns.
+    fn let_time_pass(
+        &mut self,
+        seconds: f64,
+        inertial_from_body: &Rotation3<f64>,
+        bias_variance: f64,
+    ) {
+        let config = &self.config;
+        let drift = config.field_walk.powi(2) + bias_variance * BIAS_MEMORY;
+        let turned = self.iron_attitude.angle_to(inertial_from_body);
+        let has_turned = turned > config.iron_turn;
+        let changed = if has_turned { config.iron_walk.powi(2) * turned } else { 0.0 };
+        for i in 0..3 {
+            self.covariance[(FIELD + i, FIELD + i)] += drift * seconds;
+            self.covariance[(IRON + i, IRON + i)] += changed;
+        }
+        if has_turned {
+            self.iron_attitude = *inertial_from_body;
+        }
+    }
+
+    /// Conditions the Kalman filter on a reading; `None` where that cannot be computed.
     fn take_in(
         &mut self,
         reading: &Vector3<f64>,
         field_rate: &Vector3<f64>,
         turn: &Matrix3<f64>,
         seconds: f64,
-    ) -> Option<f64> {
-        let MagneticConfig { noise, noise_correlation_time, field_walk, iron_walk, .. } =
-            self.config;
-        for i in 0..3 {
-            self.covariance[(FIELD + i, FIELD + i)] += field_walk.powi(2) * seconds;
-            self.covariance[(IRON + i, IRON + i)] += iron_walk.powi(2) * seconds;
-        }
+    ) -> Option<()> {
+        let MagneticConfig { noise, noise_correlation_time, .. } = self.config;
         let mut h = SMatrix::<f64, 3, 7>::zeros();
         h.fixed_view_mut::<3, 3>(0, FIELD).fill_with_identity();
         h.fixed_view_mut::<3, 3>(0, IRON).copy_from(turn);
@@ -177,7 +221,7 @@ impl MagneticFinder {
         let distance = innovation.dot(&(expected.try_inverse()? * innovation));
         self.judge(distance, seconds);
 
-        let correlated = self.field_noise.variance(noise, seconds, noise_correlation_time);
+        let correlated = self.field_error.added(noise, seconds, noise_correlation_time).recip();
         let expected =
             h * self.covariance * h.transpose() + Matrix3::from_diagonal_element(correlated);
         let gain = self.covariance * h.transpose() * expected.try_inverse()?;
@@ -186,7 +230,7 @@ impl MagneticFinder {
         let covariance =
             kept * self.covariance * kept.transpose() + gain * gain.transpose() * correlated;
         self.covariance = 0.5 * (covariance + covariance.transpose());
-        Some(noise)
+        Some(())
     }
 
     /// Decides whether the field is to be trusted, with hysteresis.
@@ -196,7 +240,7 @@ impl MagneticFinder {
             self.disturbed = true;
             self.calm = 0.0;
             forget_block(&mut self.covariance, IRON, config.new_iron_sd.powi(2));
-            self.field_noise = CorrelatedNoise::default();
+            self.field_error = CorrelatedError::default();
         } else if distance < config.calm_below {
             self.calm += seconds;
             self.disturbed &= self.calm <= config.calm_time;
@@ -207,7 +251,7 @@ impl MagneticFinder {
         if self.unexplained > config.patience {
             self.unexplained = 0.0;
             forget_block(&mut self.covariance, FIELD, 1.0);
-            self.field_noise = CorrelatedNoise::default();
+            self.field_error = CorrelatedError::default();
         }
     }
 }

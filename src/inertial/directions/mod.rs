@@ -7,12 +7,17 @@
 //!
 //! - **Specific force** ([`gravity`]). The acceleration of a body that stays in its place averages
 //!   out; two low-passes in series let through `1/(1 + w^2 T^2)` of a motion at the frequency `w`.
-//!   Its momentary strength is measured and lowers the concentration.
+//!   What is left of it is measured against the attitude that the filter expects, and lowers the
+//!   concentration.
 //! - **Magnetic field** ([`magnetic`]). `m = R^T field + iron + delay R^T-rate`: a Kalman filter
 //!   tells the field, which stands still, from the iron of the device, which turns with the body,
 //!   and from the delay of the magnetometer. A reading far from what it expects means that iron
 //!   has come or gone; the iron is then unknown until the body's turning reveals it anew.
 //! - **Rest** ([`rest`]). A gyroscope that stands still shows its bias.
+//!
+//! The bias that is taken off the gyroscope is that of the filter behind the directions
+//! ([`Prediction`]): whenever it changes, what the low-passes hold is turned as if it had been known
+//! before.
 //!
 //! What disturbs is correlated in time: samples closer together than the correlation time `T` say
 //! the same thing again. A Gauss-Markov error carries one independent sample every `2 T`, so a
@@ -24,6 +29,7 @@ mod magnetic;
 mod rest;
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
+use serde::{Deserialize, Serialize};
 
 pub use gravity::GravityConfig;
 pub use magnetic::MagneticConfig;
@@ -35,27 +41,33 @@ use gravity::GravityFinder;
 use magnetic::MagneticFinder;
 use rest::RestFinder;
 
+/// Time between two measurements, over which the readings are averaged, s.
+const INTERVAL: f64 = 0.1;
+
 /// How directions are found. The defaults are for sensors of consumer grade in hand-held motion.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct DirectionConfig {
-    /// Time between two measurements, over which the readings are averaged, s.
-    pub interval: f64,
-    /// After a gap longer than this everything but iron, delay and gyro bias is forgotten, s.
-    pub max_gap: f64,
     pub gravity: GravityConfig,
     pub magnetic: MagneticConfig,
     pub rest: RestConfig,
 }
 
-impl Default for DirectionConfig {
-    fn default() -> Self {
-        Self {
-            interval: 0.1,
-            max_gap: 1.0,
-            gravity: GravityConfig::default(),
-            magnetic: MagneticConfig::default(),
-            rest: RestConfig::default(),
-        }
+/// What the filter behind the directions believes before they come.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Prediction {
+    /// rad/s.
+    pub gyro_bias: Vector3<f64>,
+    /// rad^2/s^2.
+    pub gyro_bias_covariance: Matrix3<f64>,
+    /// Up in body coordinates and its variance about each perpendicular axis, rad^2; `None` while
+    /// the attitude is sought.
+    pub up: Option<(Vector3<f64>, f64)>,
+}
+
+impl Prediction {
+    fn bias_variance(&self) -> f64 {
+        self.gyro_bias_covariance.trace() / 3.0
     }
 }
 
@@ -63,13 +75,18 @@ impl Default for DirectionConfig {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BodyDirection {
     pub in_body: Vector3<f64>,
-    /// Inverse of the variance about each perpendicular axis, rad^-2.
+    /// What it adds to the readings before: inverse of a variance about each perpendicular axis,
+    /// rad^-2.
     pub concentration: f64,
+    /// Variance of the direction if nothing else is known, rad^2.
+    pub variance: f64,
 }
 
 /// What is known at the end of an interval.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Directions {
+    /// Length of the interval, s.
+    pub seconds: f64,
     /// Against gravity; `None` in free fall.
     pub up: Option<BodyDirection>,
     /// Horizontal, towards magnetic north; `None` without a magnetometer or where the field is
@@ -95,6 +112,8 @@ struct Interval {
     inertial_specific_force: Vector3<f64>,
     /// `inertial_from_body` where the field was read; a mean of rotations is not one itself.
     turn: Matrix3<f64>,
+    /// Magnetic field in body coordinates.
+    field: Vector3<f64>,
     /// Magnetic field in inertial coordinates.
     inertial_field: Vector3<f64>,
     /// `inertial_from_body (w x m)` with the field `m` that is not the iron's: by how much a delay
@@ -105,8 +124,11 @@ struct Interval {
 /// Finds the directions in a stream of samples.
 #[derive(Debug, Clone)]
 pub struct DirectionFinder {
-    config: DirectionConfig,
     inertial_from_body: Rotation3<f64>,
+    /// Integral of `inertial_from_body`, s: by this much of a bias the frame would have turned.
+    turn_by_bias: Matrix3<f64>,
+    /// The bias that is taken off, rad/s.
+    gyro_bias: Vector3<f64>,
     /// The interval that is being filled: sums until it is complete.
     interval: Interval,
     samples: usize,
@@ -117,37 +139,42 @@ pub struct DirectionFinder {
 }
 
 impl DirectionFinder {
-    pub fn new(config: &DirectionConfig) -> Self {
+    /// A finder where gravity has this magnitude, m/s^2.
+    pub fn new(config: &DirectionConfig, gravity: f64) -> Self {
         Self {
-            config: config.clone(),
             inertial_from_body: Rotation3::identity(),
+            turn_by_bias: Matrix3::zeros(),
+            gyro_bias: Vector3::zeros(),
             interval: Interval::default(),
             samples: 0,
             field_samples: 0,
-            gravity: GravityFinder::new(&config.gravity),
+            gravity: GravityFinder::new(&config.gravity, gravity),
             magnetic: MagneticFinder::new(&config.magnetic),
             rest: RestFinder::new(&config.rest),
         }
-    }
-
-    /// Forgets what a gap in the data makes worthless.
-    pub fn forget_attitude(&mut self) {
-        self.interval = Interval::default();
-        (self.samples, self.field_samples) = (0, 0);
-        self.gravity = GravityFinder::new(&self.config.gravity);
-        self.magnetic.forget_field();
-        self.rest.forget_motion();
-    }
-
-    /// Gyro bias as seen at rest and its variance per axis, rad/s and rad^2/s^2.
-    pub fn gyro_bias(&self) -> (Vector3<f64>, f64) {
-        self.rest.bias()
     }
 
     /// Field of the iron that turns with the body, in body coordinates and in the magnetometer's
     /// unit.
     pub fn iron(&self) -> Vector3<f64> {
         self.magnetic.iron()
+    }
+
+    /// Passes over a gap in which the body turned by the rotation vector `angle`, give or take the
+    /// `variance` about each axis, rad and rad^2.
+    pub fn pass_gap(&mut self, angle: &Vector3<f64>, variance: f64) {
+        self.inertial_from_body *= so3::exp(angle);
+        self.interval = Interval::default();
+        (self.samples, self.field_samples) = (0, 0);
+        self.gravity.forget_direction();
+        self.magnetic.pass_gap(variance);
+        self.rest.forget_motion();
+    }
+
+    /// The body has turned by an angle that is known to this variance only, rad^2.
+    pub fn doubt_turn(&mut self, variance: f64) {
+        self.gravity.doubt_turn(variance);
+        self.magnetic.pass_gap(variance);
     }
 
     /// Takes a sample whose reading of the gyroscope holds for the `seconds` before it.
@@ -160,9 +187,12 @@ impl DirectionFinder {
         sample: &ImuSample,
         field: Option<&Vector3<f64>>,
         seconds: f64,
+        prediction: &Prediction,
     ) -> Option<Directions> {
-        let rate = sample.angular_velocity - self.rest.bias().0;
+        self.set_gyro_bias(&prediction.gyro_bias);
+        let rate = sample.angular_velocity - self.gyro_bias;
         self.inertial_from_body *= so3::exp(&(rate * seconds));
+        self.turn_by_bias += self.inertial_from_body.matrix() * seconds;
         let (turn, sums) = (self.inertial_from_body, &mut self.interval);
         sums.seconds += seconds;
         sums.rate += sample.angular_velocity;
@@ -171,31 +201,51 @@ impl DirectionFinder {
         self.samples += 1;
         if let Some(field) = field {
             sums.turn += turn.matrix();
+            sums.field += field;
             sums.inertial_field += turn * field;
             sums.field_rate += turn * rate.cross(&(field - self.magnetic.iron()));
             self.field_samples += 1;
         }
-        (sums.seconds > self.config.interval - 0.5 * seconds).then(|| self.complete_interval())
+        (sums.seconds > INTERVAL - 0.5 * seconds).then(|| self.complete_interval(prediction))
     }
 
-    fn complete_interval(&mut self) -> Directions {
+    /// Turns what was read before as this bias would have had it, in the frame of the last sample.
+    fn set_gyro_bias(&mut self, bias: &Vector3<f64>) {
+        let change = bias - self.gyro_bias;
+        if change != Vector3::zeros() {
+            self.gyro_bias = *bias;
+            self.gravity.change_bias(&change, &self.turn_by_bias);
+        }
+    }
+
+    fn complete_interval(&mut self, prediction: &Prediction) -> Directions {
         let field_was_read = self.field_samples > 0;
         let mean = self.take_mean();
         self.inertial_from_body.renormalize();
-        let body_from_inertial = self.inertial_from_body.inverse();
-        let up = self.gravity.measure(&mean);
-        let north = up
-            .filter(|_| field_was_read)
-            .and_then(|up| self.magnetic.measure(&mean, &up.direction));
+        let inertial_from_body = self.inertial_from_body;
+        let in_inertial = |(up, variance): (Vector3<f64>, f64)| {
+            InertialDirection::new(inertial_from_body * up, variance)
+        };
+        let expected = prediction.up.map(in_inertial);
+        let up = self.gravity.measure(&mean, &self.turn_by_bias, prediction, expected.as_ref());
+        let best = match (up, expected) {
+            (Some(found), Some(expected)) if expected.variance < found.variance => Some(expected),
+            (found, _) => found,
+        };
+        let north = best.filter(|_| field_was_read).and_then(|up| {
+            self.magnetic.measure(&mean, &up, &inertial_from_body, prediction.bias_variance())
+        });
         let in_body = |found: InertialDirection| BodyDirection {
-            in_body: body_from_inertial * found.direction,
+            in_body: inertial_from_body.inverse() * found.direction,
             concentration: found.concentration,
+            variance: found.variance,
         };
         Directions {
+            seconds: mean.seconds,
             up: up.map(in_body),
             north: north.map(in_body),
             disturbed: self.magnetic.is_disturbed(),
-            resting_rate: self.rest.measure(&mean),
+            resting_rate: self.rest.measure(&mean, prediction),
         }
     }
 
@@ -211,17 +261,27 @@ impl DirectionFinder {
             specific_force: sums.specific_force * of_all,
             inertial_specific_force: sums.inertial_specific_force * of_all,
             turn: sums.turn * of_fields,
+            field: sums.field * of_fields,
             inertial_field: sums.inertial_field * of_fields,
             field_rate: sums.field_rate * of_fields,
         }
     }
 }
 
-/// A direction in inertial coordinates and its concentration.
+/// A direction in inertial coordinates.
 #[derive(Debug, Clone, Copy)]
 struct InertialDirection {
     direction: Vector3<f64>,
+    /// Variance about each perpendicular axis, rad^2.
+    variance: f64,
+    /// What it adds to the readings before, rad^-2.
     concentration: f64,
+}
+
+impl InertialDirection {
+    fn new(direction: Vector3<f64>, variance: f64) -> Self {
+        Self { direction, variance, concentration: variance.recip() }
+    }
 }
 
 /// Share of an independent sample that a measurement after `seconds` carries if its error has the
@@ -230,17 +290,26 @@ fn independent_share(seconds: f64, correlation_time: f64) -> f64 {
     (0.5 * seconds / correlation_time).min(1.0)
 }
 
-/// The variance that stands for correlated noise of the variance given: the first measurement
-/// counts in full, each further one for its share of an independent sample.
+/// The information of readings whose errors are correlated in time: the first one counts in full,
+/// each further one for its share of an independent sample, and a better one for what it is better.
 #[derive(Debug, Clone, Copy, Default)]
-struct CorrelatedNoise {
-    measured_before: bool,
+struct CorrelatedError {
+    /// Information within the last correlation time: inverse of a variance.
+    given: f64,
 }
 
-impl CorrelatedNoise {
-    fn variance(&mut self, variance: f64, seconds: f64, correlation_time: f64) -> f64 {
-        let first = !std::mem::replace(&mut self.measured_before, true);
-        if first { variance } else { variance / independent_share(seconds, correlation_time) }
+impl CorrelatedError {
+    /// The information that a reading of this variance adds.
+    fn added(&mut self, variance: f64, seconds: f64, correlation_time: f64) -> f64 {
+        let share = independent_share(seconds, correlation_time);
+        let added = (share / variance).max(variance.recip() - self.given);
+        self.given = self.given * (1.0 - share) + added;
+        added
+    }
+
+    /// The state that was measured has since changed by something of this variance.
+    fn lose(&mut self, variance: f64) {
+        self.given /= 1.0 + self.given * variance;
     }
 }
 

@@ -64,7 +64,7 @@ impl Scene {
                 };
                 let delayed = (self.attitude)(t - self.delay);
                 let field = delayed.inverse() * FIELD + (self.iron)(t);
-                finder.push(&sample, Some(&field), h).map(|directions| (t, directions))
+                finder.push(&sample, Some(&field), h, &KNOWN_BIAS).map(|directions| (t, directions))
             })
             .collect()
     }
@@ -92,8 +92,14 @@ impl Scene {
     }
 }
 
+const KNOWN_BIAS: Prediction = Prediction {
+    gyro_bias: Vector3::new(0.0, 0.0, 0.0),
+    gyro_bias_covariance: Matrix3::new(1e-10, 0.0, 0.0, 0.0, 1e-10, 0.0, 0.0, 0.0, 1e-10),
+    up: None,
+};
+
 fn finder() -> DirectionFinder {
-    DirectionFinder::new(&DirectionConfig::default())
+    DirectionFinder::new(&DirectionConfig::default(), 9.81)
 }
 
 #[test]
@@ -155,42 +161,119 @@ fn the_delay_of_the_magnetometer_is_learnt() {
     let worst = |delay_sd: f64| {
         let mut config = DirectionConfig::default();
         config.magnetic.delay_sd = delay_sd;
-        let found = scene.run(&mut DirectionFinder::new(&config), 0.0, 20.0);
+        let found = scene.run(&mut DirectionFinder::new(&config, 9.81), 0.0, 20.0);
         scene.worst_north(&found[100..])
     };
     let (learnt, ignored) = (worst(MagneticConfig::default().delay_sd), worst(0.0));
     assert!(ignored > 10.0 && learnt < 0.25 * ignored, "{learnt} {ignored}");
 }
 
-#[test]
-fn a_resting_gyroscope_shows_its_bias() {
-    let gyro_bias = Vector3::new(0.01, -0.02, 0.005);
-    let rest = Scene { attitude: lying, gyro_bias, ..HELD };
+/// Three seconds of samples that do not change but for the field, which turns at `field_rate`.
+fn resting_rates(rate: f64, field_rate: f64, bias_sd: f64) -> Vec<(Vector3<f64>, f64)> {
     let mut finder = finder();
-    let found = rest.run(&mut finder, 0.0, 10.0);
-    // Not before all intervals of the window are alike.
-    assert!(found[..14].iter().all(|(_, d)| d.resting_rate.is_none()));
-    assert!(found[14..].iter().all(|(_, d)| d.resting_rate.is_some()));
-    let (bias, variance) = finder.gyro_bias();
-    assert!((bias - gyro_bias).norm() < 1e-4, "{bias:?}");
-    assert!(variance.sqrt() < 5e-4);
-    let moving = Scene { gyro_bias, ..HELD };
-    let found = moving.run(&mut finder, 10.0, 20.0);
-    assert!(found[15..].iter().all(|(_, d)| d.resting_rate.is_none()));
+    let prediction = Prediction {
+        gyro_bias_covariance: Matrix3::from_diagonal_element(bias_sd * bias_sd),
+        ..KNOWN_BIAS
+    };
+    let shown = |k: i64| {
+        let sample = ImuSample {
+            stamp: Stamp::from_nanos(k * 10_000_000),
+            angular_velocity: Vector3::new(0.0, 0.0, rate),
+            specific_force: Vector3::new(0.0, 0.0, 9.81),
+        };
+        let field = so3::exp(&Vector3::new(0.0, 0.0, -field_rate * 0.01 * k as f64)) * FIELD;
+        finder.push(&sample, Some(&field), 0.01, &prediction)
+    };
+    (1..=300).filter_map(shown).filter_map(|found| found.resting_rate).collect()
 }
 
 #[test]
-fn the_first_direction_counts_in_full_and_again_after_a_gap() {
+fn a_resting_gyroscope_shows_its_bias_however_large() {
+    for bias in [0.002, 0.15] {
+        let found = resting_rates(bias, 0.0, 0.09);
+        // Not before all intervals of the window are there.
+        assert_eq!(found.len(), 16);
+        for (rate, variance) in found {
+            assert!((rate - Vector3::new(0.0, 0.0, bias)).norm() < 1e-12);
+            assert!(variance.sqrt() < 2e-3, "{variance}");
+        }
+    }
+}
+
+#[test]
+fn a_steady_turn_is_no_rest_if_the_field_or_the_known_bias_says_so() {
+    assert!(resting_rates(0.15, 0.15, 0.09).is_empty());
+    assert!(resting_rates(0.15, 0.0, 1e-4).is_empty());
+    let found = HELD.run(&mut finder(), 0.0, 20.0);
+    assert!(found.iter().all(|(_, d)| d.resting_rate.is_none()));
+}
+
+/// A slow sway: its rate passes for constant, but not for long.
+#[test]
+fn what_a_slow_motion_hides_is_counted() {
+    let scene = Scene {
+        attitude: |t| Rotation3::from_euler_angles(0.05 * (0.6 * t).sin(), 0.0, 0.0),
+        ..HELD
+    };
+    for (t, found) in scene.run(&mut finder(), 0.0, 30.0) {
+        let Some((rate, variance)) = found.resting_rate else { continue };
+        assert!(rate.norm() < 3.0 * variance.sqrt(), "{rate} {variance} at {t}");
+    }
+}
+
+#[test]
+fn readings_of_one_error_add_up_to_what_the_best_of_them_is_worth() {
     let mut finder = finder();
-    let found = HELD.run(&mut finder, 0.0, 1.0);
-    let north = |found: &[(f64, Directions)], k: usize| found[k].1.north.unwrap().concentration;
-    let up = |found: &[(f64, Directions)], k: usize| found[k].1.up.unwrap().concentration;
-    assert!(north(&found, 0) > 50.0 * north(&found, 1));
-    assert!(up(&found, 0) > 5.0 * up(&found, 1));
-    finder.forget_attitude();
-    let again = HELD.run(&mut finder, 100.0, 101.0);
-    assert!(north(&again, 0) > 50.0 * north(&again, 1));
-    assert!(HELD.worst_up(&again) < 0.01 && HELD.worst_north(&again) < 0.5);
+    for gap in 0..2 {
+        let found = HELD.run(&mut finder, 100.0 * f64::from(gap), 100.0 * f64::from(gap) + 1.0);
+        for of in [|d: &Directions| d.up.unwrap(), |d: &Directions| d.north.unwrap()] {
+            let sum: f64 = found.iter().map(|(_, d)| of(d).concentration).sum();
+            let worth = found.iter().map(|(_, d)| of(d).variance.recip()).fold(0.0, f64::max);
+            assert!((0.95..2.5).contains(&(sum / worth)), "{sum} {worth}");
+        }
+        finder.pass_gap(&Vector3::zeros(), 10.0);
+    }
+}
+
+#[test]
+fn a_bias_that_becomes_known_turns_what_was_read_before() {
+    let bias = Vector3::new(0.02, -0.03, 0.01);
+    let scene = Scene { gyro_bias: bias, ..HELD };
+    let mut finder = finder();
+    let wrong = scene.run(&mut finder, 0.0, 4.0);
+    assert!(scene.worst_up(&wrong[30..]) > 2.5);
+    let t: f64 = 4.1;
+    let h = t - 4.0;
+    let (before, now) = (turning(4.0), turning(t));
+    let sample = ImuSample {
+        stamp: Stamp::from_nanos((t * 1e9) as i64),
+        angular_velocity: so3::log(&(before.inverse() * now)) / h + bias,
+        specific_force: now.inverse() * Vector3::new(0.0, 0.0, 9.81),
+    };
+    let known = Prediction { gyro_bias: bias, ..KNOWN_BIAS };
+    let found = finder.push(&sample, None, h, &known).unwrap().up.unwrap();
+    let error = (now * found.in_body).angle(&Vector3::z()).to_degrees();
+    assert!(error < 0.6, "{error}");
+}
+
+/// A car that brakes: what is felt is not where up was expected, and is not believed.
+#[test]
+fn a_deviation_from_the_expected_direction_lowers_the_concentration() {
+    let prediction = Prediction { up: Some((Vector3::z(), 1e-4)), ..KNOWN_BIAS };
+    let mut finder = finder();
+    let mut concentrations = Vec::new();
+    for k in 1..=800 {
+        let braking = if k > 400 { 3.0 } else { 0.0 };
+        let sample = ImuSample {
+            stamp: Stamp::from_nanos(k * 10_000_000),
+            angular_velocity: Vector3::zeros(),
+            specific_force: Vector3::new(braking, 0.0, 9.81),
+        };
+        let found = finder.push(&sample, None, 0.01, &prediction);
+        concentrations.extend(found.and_then(|found| found.up).map(|up| up.concentration));
+    }
+    let (calm, braking) = (concentrations[35], concentrations[60]);
+    assert!(braking < 0.01 * calm, "{braking} {calm}");
 }
 
 #[test]
@@ -202,10 +285,10 @@ fn sensors_that_show_no_direction_yield_none() {
     };
     let zero = Vector3::zeros();
     let vertical = Vector3::new(0.0, 0.0, -4e-5);
-    let falls = finder().push(&sample(0.0), Some(&FIELD), 0.1).unwrap();
+    let falls = finder().push(&sample(0.0), Some(&FIELD), 0.1, &KNOWN_BIAS).unwrap();
     assert!(falls.up.is_none() && falls.north.is_none());
     for field in [None, Some(&zero), Some(&vertical)] {
-        let found = finder().push(&sample(9.81), field, 0.1).unwrap();
+        let found = finder().push(&sample(9.81), field, 0.1, &KNOWN_BIAS).unwrap();
         assert!(found.up.is_some() && found.north.is_none(), "{found:?}");
     }
 }
