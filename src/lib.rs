@@ -8,6 +8,7 @@
 pub mod alignment;
 pub mod config;
 pub mod dataset;
+mod dialect;
 pub mod distribution;
 pub mod evaluation;
 pub mod experiment;
@@ -15,6 +16,7 @@ pub mod filter;
 pub mod inertial;
 pub mod map;
 pub mod odometry;
+pub mod output;
 pub mod replay;
 pub mod sensor;
 pub mod simulation;

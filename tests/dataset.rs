@@ -102,7 +102,6 @@ fn a_folder_becomes_a_log_that_is_replayed_like_it() {
 fn failures_name_the_file() {
     let log = text(simulated_log());
     for (arguments, part) in [
-        (["convert", log, log], "overwritten"),
         (["convert", log, "/nonexistent/out.mcap"], "/nonexistent/out.mcap"),
         (["convert", "/nonexistent/in.bag", "out.mcap"], "/nonexistent/in.bag"),
     ] {

@@ -1,11 +1,10 @@
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 use anyhow::Context;
 
 use super::replay::{Plan, Settings};
-use super::terminal::{INTERRUPTED, catch_interrupts};
+use super::terminal::{INTERRUPTED, catch_interrupts, print};
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Fault};
 use mfg_vio::evaluation::Table;
@@ -74,7 +73,7 @@ pub fn run(args: &FaultsArgs) -> anyhow::Result<()> {
         }))?,
         false => table(&outcomes).to_text().trim_end().to_owned(),
     };
-    Ok(writeln!(std::io::stdout(), "{output}")?)
+    print(&output)
 }
 
 /// An error if there is a fault that never happens.

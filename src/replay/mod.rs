@@ -20,7 +20,7 @@ pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors};
 pub use faults::{FaultOutcome, Naming, Recovered, fault_grid};
 pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
-pub use outputs::state_columns;
+pub use outputs::{RESULTS, state_columns};
 pub use report::{Series, figures, report};
 
 use crate::config::Config;
@@ -29,6 +29,7 @@ use crate::evaluation::{EvaluationError, Similarity, Trajectory, is_vertical, re
 use crate::filter::FilterKind;
 use crate::inertial::pose_covariance;
 use crate::odometry::{FrontEnd, NoteLevel, Observation, Odometry, RunOptions, StepReport, run};
+use crate::output;
 use crate::sensor::{Event, ImuSample, RgbdFrame, Stamp, TruthPose};
 use evaluation::evaluate;
 use metrics::{peak_memory_bytes, stage_summaries};
@@ -162,6 +163,7 @@ pub fn replay(
         log: log.as_mut(),
         given,
         pending: None,
+        body_from_camera: camera_in_reference(config, summary.has_imu),
         truth: &mut truth,
         faults,
         first: &mut first,
@@ -274,7 +276,7 @@ fn path_length(poses: &[TruthPose]) -> f64 {
 fn write_metrics(directory: &Path, metrics: &Metrics) -> Result<(), ReplayError> {
     let path = directory.join("metrics.json");
     let text = serde_json::to_string_pretty(metrics).map_err(std::io::Error::other);
-    text.and_then(|text| std::fs::write(&path, text + "\n"))
+    text.and_then(|text| output::write(&path, text + "\n"))
         .map_err(|source| ReplayError::Write { path, source })
 }
 
@@ -292,12 +294,21 @@ impl Span {
     }
 }
 
+/// Where in the body of the reference the camera is, if the estimate is of the camera: without an
+/// IMU.
+fn camera_in_reference(config: &Config, has_imu: bool) -> Isometry3<f64> {
+    let mounting = config.camera.imu_from_camera().filter(|_| !has_imu);
+    mounting.unwrap_or_else(Isometry3::identity)
+}
+
 /// The log's events; the reference poses among them are noted, or replaced by given ones.
 struct EventSource<'a> {
     log: &'a mut dyn Log,
     given: Option<Peekable<std::vec::IntoIter<TruthPose>>>,
     /// The log's next event, while given poses go before it.
     pending: Option<Event>,
+    /// From the frame whose poses are estimated to that of the reference.
+    body_from_camera: Isometry3<f64>,
     truth: &'a mut Vec<TruthPose>,
     faults: &'a [Fault],
     /// Stamp of the first event.
@@ -333,6 +344,13 @@ impl Iterator for EventSource<'_> {
                 Event::Truth(pose)
             }
             None => event,
+        };
+        let event = match event {
+            Event::Truth(pose) => Event::Truth(TruthPose {
+                world_from_body: pose.world_from_body * self.body_from_camera,
+                ..pose
+            }),
+            other => other,
         };
         if let Event::Truth(pose) = &event {
             self.truth.push(*pose);

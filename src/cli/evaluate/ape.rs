@@ -46,6 +46,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let suspicions = evaluation::suspicions(reference, estimate, &pairs, &options);
         let scale_check = args.scale_check.then(|| evaluation::similarity_scale(&pairs));
         let result = evaluation::ape_of_pairs(pairs, alignment, align_n, relation)?;
+        let borrowed = result.by_positions.map(|rmse| {
+            format!(
+                "the rotation of the alignment is taken from the attitudes: the positions lie on \
+                 a line or in a point, and would leave an error of {rmse:.1} deg"
+            )
+        });
         let figure =
             || evaluation::trajectory_figure(&result.pairs, &result.errors, relation.unit());
         Ok(Compared {
@@ -56,7 +62,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
             errors: result.errors,
             statistics: result.statistics,
             kind: Kind::Absolute { scale_check },
-            warnings: suspicions.iter().map(ToString::to_string).collect(),
+            warnings: suspicions.iter().map(ToString::to_string).chain(borrowed).collect(),
         })
     };
     let (mut presentation, reports) = inputs.compare(title, &args.output, compare)?;

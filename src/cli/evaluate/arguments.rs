@@ -100,11 +100,6 @@ pub(super) fn time_offset(text: &str) -> Result<TimeOffset, String> {
     if text == "auto" { Ok(TimeOffset::Auto) } else { finite(text).map(TimeOffset::Fixed) }
 }
 
-/// Ends the program as clap does for what it can tell by itself.
-pub(super) fn wrong_usage(message: String) -> ! {
-    clap::Error::raw(clap::error::ErrorKind::ValueValidation, message + "\n").exit()
-}
-
 pub(super) fn finite(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use mfg_vio::evaluation::{self, Comparison, Table};
+use mfg_vio::evaluation::{self, Comparison, Run, Table};
 
 use super::arguments::positive;
 use super::presentation::{Output, Presentation};
@@ -43,11 +43,19 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     args.output.emit(&Presentation {
         title: "Comparison of runs".to_owned(),
         notes: vec![format!("success: position RMSE of at most {} m", args.success)],
-        warnings: Vec::new(),
+        warnings: unfinished(&comparison),
         json: serde_json::to_value(&comparison)?,
         tables,
         figures: vec![figure],
     })
+}
+
+fn unfinished(comparison: &Comparison) -> Vec<String> {
+    let runs = comparison.methods.iter().flat_map(|method| &method.runs);
+    let warning = |run: &Run| {
+        format!("{}: no metrics.json, so it did not finish: no success", run.directory.display())
+    };
+    runs.filter(|run| !run.finished).map(warning).collect()
 }
 
 fn methods(comparison: &Comparison) -> Table {

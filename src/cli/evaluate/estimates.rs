@@ -153,6 +153,7 @@ fn record<'a>(
     reference: &Trajectory,
     estimates: impl Iterator<Item = (&'a str, f64, &'a Compared)>,
 ) -> anyhow::Result<()> {
+    use mfg_vio::output::NewFile;
     use mfg_vio::viewer::{ComparedEstimate, record_comparison};
 
     let estimates: Vec<_> = estimates
@@ -161,7 +162,10 @@ fn record<'a>(
             ComparedEstimate { name, pairs, time_offset, stamps, errors }
         })
         .collect();
-    Ok(record_comparison(path, title, unit, reference, &estimates)?)
+    let io = || path.display().to_string();
+    let file = NewFile::create(path).with_context(io)?;
+    record_comparison(file.path(), title, unit, reference, &estimates)?;
+    file.finish().with_context(io)
 }
 
 #[cfg(not(feature = "viewer"))]

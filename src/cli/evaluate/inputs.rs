@@ -8,6 +8,7 @@ use clap::Args;
 use mfg_vio::evaluation::{self, EvaluationError, TrajectoryFile, TrajectoryFormat};
 use rayon::prelude::*;
 
+use super::super::terminal::tell;
 use super::arguments::{Matching, RelationArg};
 
 /// What is compared with what.
@@ -29,10 +30,18 @@ pub(super) struct Inputs {
     pub(super) rrd: Option<PathBuf>,
 }
 
-pub(super) fn warn_of_order(path: &Path, file: TrajectoryFile) -> TrajectoryFile {
+/// Says what of a file was not as it should be, though it could be read.
+pub(super) fn with_warnings(path: &Path, file: TrajectoryFile) -> TrajectoryFile {
+    let warn = |text: String| tell(&format!("warning: {}: {text}", path.display()));
     if file.reordered > 0 {
-        let count = file.reordered;
-        eprintln!("warning: {}: {count} poses were out of order and sorted", path.display());
+        warn(format!("{} poses were out of order and sorted", file.reordered));
+    }
+    if file.repeated > 0 {
+        warn(format!("{} poses repeat another one and were left out", file.repeated));
+    }
+    if let Some(line) = file.first_contradiction {
+        let count = file.contradicting;
+        warn(format!("{count} poses have the stamp of another pose, first in line {line}"));
     }
     file
 }
@@ -44,11 +53,11 @@ impl Inputs {
             || evaluation::read_trajectory(&self.reference),
             || self.estimates.par_iter().map(|path| evaluation::read_trajectory(path)).collect(),
         );
-        let reference = warn_of_order(&self.reference, reference?);
+        let reference = with_warnings(&self.reference, reference?);
         let estimates: Vec<Result<TrajectoryFile, EvaluationError>> = estimates;
         let mut checked = Vec::new();
         for (path, estimate) in self.estimates.iter().zip(estimates) {
-            let estimate = warn_of_order(path, estimate?);
+            let estimate = with_warnings(path, estimate?);
             check_comparable(path, &reference, &estimate)?;
             checked.push(estimate);
         }

@@ -3,11 +3,12 @@
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use mfg_vio::evaluation::{self, NeesOptions, NeesResult, NeesSummary, Table};
 
-use super::arguments::{AlignArg, Matching, wrong_usage};
-use super::inputs::warn_of_order;
+use super::super::WrongUsage;
+use super::arguments::{AlignArg, Matching};
+use super::inputs::with_warnings;
 use super::presentation::{Output, Presentation};
 
 pub(super) const HELP: &str = "\
@@ -39,9 +40,9 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     if matches!(args.align, Some(AlignArg::Sim3)) {
-        wrong_usage("--align sim3: a belief has no scale".to_owned());
+        bail!(WrongUsage("--align sim3: a belief has no scale".to_owned()));
     }
-    let reference = warn_of_order(&args.reference, evaluation::read_trajectory(&args.reference)?);
+    let reference = with_warnings(&args.reference, evaluation::read_trajectory(&args.reference)?);
     let path = match args.directory.is_dir() {
         true => args.directory.join("state.csv"),
         false => args.directory.clone(),

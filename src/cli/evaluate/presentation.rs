@@ -1,11 +1,11 @@
 //! What a command has to show, and where to.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use clap::Args;
 use mfg_vio::evaluation::{Figure, Report, Table, write_html};
 
+use super::super::terminal::{print, tell};
 use super::arguments::plot_file;
 
 /// Everything that a command has to show, before it is known where.
@@ -63,19 +63,17 @@ impl Output {
         }
         let first = tables.first().map(|(_, table)| table);
         let machine = match first {
-            _ if self.json => Some(serde_json::to_string_pretty(json)? + "\n"),
+            _ if self.json => Some(serde_json::to_string_pretty(json)?),
             Some(table) if self.csv => Some(table.to_csv()),
             Some(table) if self.latex => Some(table.to_latex()),
             _ => None,
         };
         for warning in warnings {
-            eprintln!("warning: {warning}");
+            tell(&format!("warning: {warning}"));
         }
         let text = match machine {
             Some(text) => {
-                for note in notes {
-                    eprintln!("{note}");
-                }
+                notes.iter().for_each(|note| tell(note));
                 text
             }
             None => {
@@ -86,10 +84,6 @@ impl Output {
                 text
             }
         };
-        // A reader that closes the pipe early is no error.
-        match std::io::stdout().write_all(text.as_bytes()) {
-            Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(e.into()),
-            _ => Ok(()),
-        }
+        print(&text)
     }
 }

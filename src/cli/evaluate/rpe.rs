@@ -2,12 +2,14 @@
 
 use std::num::NonZeroUsize;
 
+use anyhow::bail;
 use clap::ValueEnum;
 use mfg_vio::evaluation::{
     self, AssociationOptions, Delta, EvaluationError, Relation, RpeOptions, Table, Trajectory,
 };
 
-use super::arguments::{AlignArg, positive, wrong_usage};
+use super::super::WrongUsage;
+use super::arguments::{AlignArg, positive};
 use super::estimates::{Compared, EstimateReport, Kind};
 use super::inputs::Inputs;
 use super::presentation::Output;
@@ -51,13 +53,14 @@ enum UnitArg {
 
 pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let inputs = &args.inputs;
+    let delta = args.delta;
     let delta = match args.unit {
-        UnitArg::F if args.delta.fract() == 0.0 => Delta::Frames(args.delta as usize),
-        UnitArg::F => wrong_usage(format!("--delta {}: a number of frames is whole", args.delta)),
-        UnitArg::S => Delta::Seconds(args.delta),
-        UnitArg::M => Delta::Metres(args.delta),
-        UnitArg::Deg if args.delta <= 180.0 => Delta::Degrees(args.delta),
-        UnitArg::Deg => wrong_usage(format!("--delta {}: an angle is at most 180", args.delta)),
+        UnitArg::F if delta.fract() == 0.0 => Delta::Frames(delta as usize),
+        UnitArg::F => bail!(WrongUsage(format!("--delta {delta}: a number of frames is whole"))),
+        UnitArg::S => Delta::Seconds(delta),
+        UnitArg::M => Delta::Metres(delta),
+        UnitArg::Deg if delta <= 180.0 => Delta::Degrees(delta),
+        UnitArg::Deg => bail!(WrongUsage(format!("--delta {delta}: an angle is at most 180"))),
     };
     let relation = Relation::from(inputs.relation);
     let (unit, kind) = (relation.unit(), if args.all_pairs { "all" } else { "consecutive" });

@@ -9,11 +9,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Once;
 use std::sync::Once;
 
+use image::ImageEncoder;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use serde::Serialize;
 
+use crate::output;
 use canvas::Canvas;
 /// A picture of several panels.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
@@ -150,16 +152,25 @@ impl Figure {
     /// Saves as SVG or PNG, by the extension of `path`.
     pub fn save(&self, path: &Path) -> Result<(), PlotError> {
         match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
-            Some("svg") => std::fs::write(path, self.to_svg()?)
-                .map_err(|error| PlotError::Io { path: path.to_owned(), error }),
-            Some("png") => {
-                let (width, height) = self.size();
-                let size = (width * PNG_SCALE, height * PNG_SCALE);
-                let root = BitMapBackend::new(path, size).into_drawing_area();
-                self.draw(&root, PNG_SCALE)
-            }
-            _ => Err(PlotError::Extension { path: path.to_owned() }),
+            Some("svg") => output::write(path, self.to_svg()?),
+            Some("png") => output::write(path, self.to_png()?),
+            _ => return Err(PlotError::Extension { path: path.to_owned() }),
         }
+        .map_err(|error| PlotError::Io { path: path.to_owned(), error })
+    }
+
+    fn to_png(&self) -> Result<Vec<u8>, PlotError> {
+        let (width, height) = self.size();
+        let (width, height) = (width * PNG_SCALE, height * PNG_SCALE);
+        let mut pixels = vec![0; 3 * width as usize * height as usize];
+        let root = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
+        self.draw(&root, PNG_SCALE)?;
+        drop(root);
+        let mut png = Vec::new();
+        image::codecs::png::PngEncoder::new(&mut png)
+            .write_image(&pixels, width, height, image::ExtendedColorType::Rgb8)
+            .map_err(|error| PlotError::Drawing(error.to_string()))?;
+        Ok(png)
     }
 
     fn draw<DB: DrawingBackend>(
