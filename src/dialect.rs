@@ -42,7 +42,7 @@ impl Dialect {
     }
 
     /// The fields of a line, without blanks and quotes around them.
-    pub fn fields<'a>(&self, line: &'a str) -> impl Iterator<Item = &'a str> + use<'a> {
+    pub fn fields<'a>(&self, line: &'a str) -> impl Iterator<Item = &'a str> + Clone + use<'a> {
         let separator = self.separator;
         let is_separator = move |c: char| match separator {
             Separator::Blanks => c.is_whitespace(),
@@ -113,6 +113,13 @@ pub fn axis_of(name: &str) -> Option<(char, String)> {
     Some((axis, stem.to_owned()))
 }
 
+/// Whether a column of this name holds the time.
+pub fn is_stamp(name: &str) -> bool {
+    let name = name.split(['[', '(']).next().unwrap_or_default().trim().to_lowercase();
+    let plain = name.trim_start_matches('%').trim_end_matches("_ns").trim_end_matches("_s");
+    ["t", "time", "timestamp", "stamp"].contains(&plain)
+}
+
 /// Where the parts of a pose stand in a line, by the names of the columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PoseColumns {
@@ -137,7 +144,7 @@ impl PoseColumns {
                     let is_quaternion = stem.starts_with('q') || stem.contains("orientation");
                     is_position.then_some(1 + axis).or(is_quaternion.then_some(4 + axis))
                 }
-                None => (name.to_lowercase().contains("time") || name == "t").then_some(0),
+                None => is_stamp(name).then_some(0),
             };
             let Some(role) = role else { continue };
             if columns[role].replace(index).is_some() {

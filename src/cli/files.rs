@@ -4,7 +4,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Arg, ArgMatches, Command};
-use mfg_vio::output::Files;
+use mfg_vio::output::{Files, resolved};
 
 use super::results::Results;
 
@@ -22,6 +22,8 @@ const LOGS: [&str; 3] = ["log", "input", "root"];
 pub fn prepare(command: &Command, matches: &ArgMatches) -> anyhow::Result<()> {
     let (path, command, matches) = innermost(command, matches);
     let mut files = Files::new();
+    // A recording may be wanted where it would lie anyway.
+    let recording = paths(matches, "rrd").into_iter().map(|path| resolved(path)).next();
     let mut earlier = Vec::new();
     for argument in command.get_arguments() {
         let id = argument.get_id().as_str();
@@ -35,7 +37,7 @@ pub fn prepare(command: &Command, matches: &ArgMatches) -> anyhow::Result<()> {
                 }
             } else if is_directory(argument) {
                 let results = Results::of(&path);
-                results.declare(&mut files, &role, value);
+                results.declare(&mut files, &role, value, recording.as_deref());
                 earlier.push((results, value.clone()));
             } else {
                 files.writes(&role, value);

@@ -4,7 +4,7 @@ use std::io::ErrorKind;
 use std::path::Path;
 
 use anyhow::Context;
-use mfg_vio::output::Files;
+use mfg_vio::output::{Files, resolved};
 use mfg_vio::replay;
 
 const DEMO: [&str; 8] = [
@@ -53,10 +53,12 @@ impl Results {
         Self::known(command).is_some()
     }
 
-    /// Adds the files to those that a command writes.
-    pub fn declare(&self, files: &mut Files, role: &str, directory: &Path) {
-        for name in &self.names {
-            files.writes(role, &directory.join(name));
+    /// Adds the files to those that a command writes, but for the one at the place `named`, which
+    /// is known by a name of its own.
+    pub fn declare(&self, files: &mut Files, role: &str, directory: &Path, named: Option<&Path>) {
+        let paths = self.names.iter().map(|name| directory.join(name));
+        for path in paths.filter(|path| named != Some(&resolved(path))) {
+            files.writes(role, &path);
         }
         if self.has_runs {
             files.writes_below(role, directory);

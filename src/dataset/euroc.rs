@@ -159,7 +159,7 @@ fn imu(stamp: Stamp, row: &Row, names: Option<&str>) -> Result<Entry, Rejection>
 fn truth(stamp: Stamp, row: &Row, names: Option<&str>) -> Result<Entry, Rejection> {
     let named = names.and_then(PoseColumns::named).map(|named| named.columns);
     let [_, px, py, pz, qx, qy, qz, qw] = named.unwrap_or([0, 1, 2, 3, 5, 6, 7, 4]);
-    let [x, y, z] = vector(row, [qx, qy, qz])?.into();
+    let [x, y, z]: [f64; 3] = vector(row, [qx, qy, qz])?.into();
     let w = vector(row, [qw; 3])?.x;
     let world_from_body = isometry(vector(row, [px, py, pz])?, [x, y, z, w])?;
     Ok(Entry::Truth(TruthPose { stamp, world_from_body }))

@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 
 use super::LogError;
 use super::text_table::{Row, TextTable, check_step};
-use crate::dialect::{Dialect, TimeUnit, axis_of};
+use crate::dialect::{Dialect, TimeUnit, axis_of, is_stamp};
 use crate::sensor::{ImuSample, Stamp};
 
 /// Our names of the columns.
@@ -133,22 +133,21 @@ impl Iterator for ImuCsv {
 }
 
 /// Names by which programs know the columns: ours, of EuRoC, of `rostopic echo -p`, of words.
-const SPELLINGS: [(char, &[&str]); 3] = [
-    ('g', &["g", "gyro", "gyr", "w", "omega", "w_rs_s", "angular_velocity"]),
-    ('a', &["a", "acc", "accel", "a_rs_s", "linear_acceleration"]),
-    ('m', &["m", "mag", "magnetic_field"]),
+/// Of the angular velocity, the specific force and the magnetic field.
+const SPELLINGS: [&[&str]; 3] = [
+    &["g", "gyro", "gyr", "w", "omega", "w_rs_s", "angular_velocity"],
+    &["a", "acc", "accel", "a_rs_s", "linear_acceleration"],
+    &["m", "mag", "magnetic_field"],
 ];
-const STAMPS: [&str; 4] = ["t", "time", "timestamp", "stamp"];
 
 /// Index into [`COLUMNS`] of a column of this name.
 fn column(name: &str) -> Option<usize> {
-    let plain = name.split(['[', '(']).next()?.trim().trim_start_matches('%').to_lowercase();
-    if STAMPS.contains(&plain.trim_end_matches("_ns").trim_end_matches("_s")) {
+    if is_stamp(name) {
         return Some(0);
     }
     let (axis, stem) = axis_of(name)?;
     let stem = stem.rsplit('.').next()?;
-    let group = SPELLINGS.iter().position(|(_, stems)| stems.contains(&stem))?;
+    let group = SPELLINGS.iter().position(|stems| stems.contains(&stem))?;
     let axis = ['x', 'y', 'z'].iter().position(|known| *known == axis)?;
     Some(1 + 3 * group + axis)
 }

@@ -110,7 +110,30 @@ fn parse_trajectory(text: &str) -> Result<TrajectoryFile, TextError> {
     let Some(layout) = layout else {
         return Err(TextError::Whole("holds no poses".to_owned()));
     };
+    if layout.unit == TimeUnit::Seconds && layout.format != TrajectoryFormat::Kitti {
+        check_seconds(&mut rows)?;
+    }
     in_order(rows, layout.format)
+}
+
+/// Poses are not a day apart: whole stamps that are count nanoseconds, others are refused.
+const LONGEST_STEP: f64 = 86_400.0;
+/// Seconds that nanoseconds in 64 bits can count.
+const LARGEST_STAMP: f64 = 9.2e9;
+
+fn check_seconds(rows: &mut [Row]) -> Result<(), TextError> {
+    let mut steps: Vec<f64> = rows.windows(2).map(|w| (w[1].stamp - w[0].stamp).abs()).collect();
+    steps.sort_unstable_by(f64::total_cmp);
+    let is_long = steps.get(steps.len() / 2).is_some_and(|step| *step > LONGEST_STEP);
+    if is_long && rows.iter().all(|row| row.stamp.fract() == 0.0) {
+        rows.iter_mut().for_each(|row| row.stamp /= 1e9);
+    }
+    match rows.iter().find(|row| row.stamp.abs() > LARGEST_STAMP) {
+        Some(Row { stamp, line, .. }) => {
+            Err(TextError::Line(*line, format!("the stamp {stamp} is no time in s")))
+        }
+        None => Ok(()),
+    }
 }
 
 /// Sorts the poses, and judges those that share a stamp.

@@ -127,6 +127,25 @@ impl Odometry {
         self.buffer.end();
     }
 
+    /// What comes now is of another run, as `reason` says: all clocks were set, or all sensors
+    /// paused. What waits must have been processed ([`Self::end`], [`Self::step`]).
+    pub fn begin_new_run(&mut self, reason: String) {
+        self.leave_off(Divergence::View, self.now.unwrap_or_default());
+        if let Some(legacy) = &mut self.legacy {
+            legacy.last_sample = None;
+        }
+        self.health.new_run();
+        self.imu.clear();
+        self.frames.clear();
+        self.truth = TruthTrack::default();
+        self.watch = SensorWatch::new(&self.config.imu);
+        self.clock = ClockWatch::default();
+        self.gyroscope = GyroscopeWatch::default();
+        (self.now, self.last_imu, self.last_frame) = (None, None, None);
+        self.ended = false;
+        self.notes.push(Note { level: NoteLevel::Warning, text: reason });
+    }
+
     pub fn stats(&self) -> OdometryStats {
         let rest = self.run.as_ref().map_or(0.0, |run| run.rest.seconds());
         let summary = self.supervisor.health();

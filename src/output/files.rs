@@ -218,7 +218,7 @@ impl Place {
 const MOST_LINKS: usize = 40;
 
 /// The place that `path` stands for, also where there is nothing yet.
-pub(super) fn resolved(path: &Path) -> PathBuf {
+pub fn resolved(path: &Path) -> PathBuf {
     let mut path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     for _ in 0..MOST_LINKS {
         let Ok(target) = fs::read_link(&path) else { break };

@@ -4,5 +4,5 @@
 mod files;
 mod new_file;
 
-pub use files::{FileNamed, Files, FilesError};
+pub use files::{FileNamed, Files, FilesError, resolved};
 pub use new_file::{NewFile, write};

@@ -352,7 +352,12 @@ impl Iterator for EventSource<'_> {
             }),
             other => other,
         };
-        if let Event::Truth(pose) = &event {
+        // A new run may go through stamps that an earlier one had.
+        let is_new =
+            |pose: &TruthPose| self.truth.last().is_none_or(|last| last.stamp < pose.stamp);
+        if let Event::Truth(pose) = &event
+            && is_new(pose)
+        {
             self.truth.push(*pose);
         }
         Some(event)
@@ -416,7 +421,6 @@ impl Session {
         odometry: &Odometry,
         observers: &mut [&mut dyn Observer],
     ) {
-        self.series.push(report);
         for note in &report.notes {
             match note.level {
                 NoteLevel::Info => tracing::info!("{}", note.text),
@@ -425,6 +429,11 @@ impl Session {
             let (seconds, text) = (report.stamp.seconds(), note.text.clone());
             self.notes.push(LogEntry { seconds, level: note.level, text });
         }
+        if self.estimate.last().is_some_and(|last| report.stamp <= last.stamp) {
+            // A new run, at stamps that an earlier one had.
+            return;
+        }
+        self.series.push(report);
         let estimate = report.state.world_from_body;
         self.estimate.push(TruthPose { stamp: report.stamp, world_from_body: estimate });
         self.covariances.push(pose_covariance(&report.covariance));

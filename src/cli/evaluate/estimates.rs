@@ -106,7 +106,7 @@ impl Inputs {
             let association = self.matching.association(path, &reference, estimate)?;
             let file = path.display().to_string();
             let case = compare(&reference.trajectory, &estimate.trajectory, association)
-                .with_context(|| file.clone())?;
+                .with_context(|| format!("{file} against {}", self.reference.display()))?;
             reports.push(EstimateReport {
                 file,
                 matched: case.pairs.len(),

@@ -59,7 +59,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         None => NeesOptions::levelled(&reference.trajectory, &estimate.trajectory, association)?,
     };
     let result = evaluation::nees(&reference.trajectory, &estimate, &options)
-        .with_context(|| path.display().to_string())?;
+        .with_context(|| format!("{} against {}", path.display(), args.reference.display()))?;
     let figures = match args.output.draws() {
         true => vec![evaluation::belief_figure(&result), evaluation::nees_figure(&result)],
         false => Vec::new(),
