@@ -4,6 +4,7 @@ use std::sync::atomic::Ordering;
 use anyhow::Context;
 
 use super::replay::{Plan, Settings};
+use super::results::Results;
 use super::terminal::{INTERRUPTED, catch_interrupts, print};
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Fault};
@@ -95,12 +96,14 @@ fn outcome(args: &FaultsArgs, fault: Option<&Fault>) -> anyhow::Result<FaultOutc
     let config = Config::for_log(&summary, file, args.settings.overrides())?;
     let config_origin =
         file.map_or_else(|| summary.config_name.clone(), |file| file.display().to_string());
+    let out = args.out.as_deref().map(|out| folder(out, fault));
+    out.as_deref().map_or(Ok(()), |out| Results::of("replay").remove(out))?;
     let plan = Plan {
         log: &args.log,
         settings: &args.settings,
         config,
         config_origin,
-        out: args.out.as_deref().map(|out| folder(out, fault)),
+        out,
         truth: args.truth.clone(),
         start: 0.0,
         duration: args.duration,
