@@ -130,20 +130,14 @@ impl Odometry {
     /// What comes now is of another run, as `reason` says: all clocks were set, or all sensors
     /// paused. What waits must have been processed ([`Self::end`], [`Self::step`]).
     pub fn begin_new_run(&mut self, reason: String) {
-        self.leave_off(Divergence::View, self.now.unwrap_or_default());
+        let time = self.buffer.now().unwrap_or_default();
+        self.abandon(Divergence::View, time);
         if let Some(legacy) = &mut self.legacy {
             legacy.last_sample = None;
         }
-        self.health.new_run();
-        self.imu.clear();
-        self.frames.clear();
-        self.truth = TruthTrack::default();
-        self.watch = SensorWatch::new(&self.config.imu);
-        self.clock = ClockWatch::default();
-        self.gyroscope = GyroscopeWatch::default();
-        (self.now, self.last_imu, self.last_frame) = (None, None, None);
-        self.ended = false;
-        self.notes.push(Note { level: NoteLevel::Warning, text: reason });
+        self.buffer.begin_anew();
+        self.supervisor.begin_anew(&self.config.imu);
+        self.supervisor.warn(reason);
     }
 
     pub fn stats(&self) -> OdometryStats {
