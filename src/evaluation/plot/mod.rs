@@ -7,7 +7,6 @@ mod canvas;
 
 use std::path::{Path, PathBuf};
 use std::sync::Once;
-use std::sync::Once;
 
 use image::ImageEncoder;
 use plotters::coord::Shift;
@@ -17,6 +16,7 @@ use serde::Serialize;
 
 use crate::output;
 use canvas::Canvas;
+
 /// A picture of several panels.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Figure {
