@@ -273,7 +273,14 @@ fn check_key(key: &str, valid: &[String], origin: &str) -> Result<(), ConfigErro
     Err(ConfigError::UnknownKey { origin: origin.to_owned(), key: key.to_owned(), nearest })
 }
 
-/// Sets one key from `section.key=value`; a value that is no TOML is taken as a string.
+/// What is no TOML: a number such as `-.5`, or else a string.
+fn plain_value(text: &str) -> toml::Value {
+    let number = text.parse().ok().filter(|number: &f64| number.is_finite());
+    number.map_or_else(|| toml::Value::String(text.to_owned()), toml::Value::Float)
+}
+
+/// Sets one key from `section.key=value`; a value that is neither TOML nor a number is taken as a
+/// string.
 fn apply(table: &mut toml::Table, text: &str, valid: &[String]) -> Result<(), ConfigError> {
     let malformed = || ConfigError::Override { text: text.to_owned() };
     let (path, value) = text.split_once('=').ok_or_else(malformed)?;
@@ -283,7 +290,7 @@ fn apply(table: &mut toml::Table, text: &str, valid: &[String]) -> Result<(), Co
         .parse::<toml::Table>()
         .ok()
         .and_then(|mut parsed| parsed.remove("value"))
-        .unwrap_or_else(|| toml::Value::String(value.trim().to_owned()));
+        .unwrap_or_else(|| plain_value(value.trim()));
     let section =
         table.entry(section.to_owned()).or_insert_with(|| toml::Value::Table(toml::Table::new()));
     section.as_table_mut().ok_or_else(malformed)?.insert(key.to_owned(), value);
@@ -335,6 +342,7 @@ mod tests {
     fn a_key_can_be_overridden() {
         assert_eq!(set("imu.gyro_noise=1e-3").unwrap().imu.gyro_noise, 1e-3);
         assert_eq!(set("imu.gravity=10").unwrap().imu.gravity, 10.0);
+        assert_eq!(set("camera.time_offset=-.5").unwrap().camera.time_offset, -0.5);
         assert_eq!(set("log.color_topic=/my/image").unwrap().log.color_topic, "/my/image");
     }
 

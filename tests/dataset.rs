@@ -102,7 +102,6 @@ fn a_folder_becomes_a_log_that_is_replayed_like_it() {
 fn failures_name_the_file() {
     let log = text(simulated_log());
     for (arguments, part) in [
-        (["convert", log, log], "overwritten"),
         (["convert", log, "/nonexistent/out.mcap"], "/nonexistent/out.mcap"),
         (["convert", "/nonexistent/in.bag", "out.mcap"], "/nonexistent/in.bag"),
     ] {
@@ -343,4 +342,22 @@ fn stereo_topics_have_the_depth_of_their_disparity() {
     assert!(found["verdict"]["text"].as_str().unwrap().contains("`log.stereo`"), "{found:#}");
     let error = open(&log, &LogConfig::default(), &ImuConfig::default()).err().unwrap();
     assert!(error.to_string().contains("`log.stereo`"), "{error}");
+}
+
+#[test]
+#[cfg(unix)]
+fn a_sensor_without_its_rows_is_a_warning() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("mav0");
+    std::fs::create_dir(&root).unwrap();
+    for camera in ["cam0", "cam1"] {
+        std::os::unix::fs::symlink(stereo_folder().join(camera), root.join(camera)).unwrap();
+    }
+    for sensor in ["imu0", "state_groundtruth_estimate0"] {
+        std::fs::create_dir(root.join(sensor)).unwrap();
+    }
+    let output = mfg_vio(&["info", text(folder.path())]);
+    let errors = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{errors}");
+    assert!(errors.contains("WARN") && errors.contains("imu0/data.csv"), "{errors}");
 }

@@ -6,7 +6,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// From the bottom of what may be used by all to what uses all.
-const LAYERS: [&str; 20] = [
+const LAYERS: [&str; 22] = [
+    "dialect",
+    "output",
     "so3",
     "distribution",
     "sensor",

@@ -1,8 +1,8 @@
 use std::path::PathBuf;
 
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::filter::attitude::AttitudeFilterKind;
-use mfg_vio::replay::{AttitudeMetrics, AttitudeRequest, replay_attitude};
+use mfg_vio::replay::{AttitudeMetrics, AttitudeRequest, Reached, replay_attitude};
 
 /// Estimate attitude and gyro bias from an IMU and a magnetometer.
 ///
@@ -54,19 +54,18 @@ pub fn run(args: &AttitudeArgs) -> anyhow::Result<()> {
     bar.finish_and_clear();
     let metrics = metrics?;
     if args.json {
-        println!("{}", serde_json::to_string(&metrics)?);
-    } else {
-        print_summary(&metrics);
-        if let Some(out) = &args.out {
-            println!("written: {}", out.join("attitude.csv").display());
-        }
+        return print(&serde_json::to_string(&metrics)?);
     }
-    Ok(())
+    let mut lines = summary(&metrics);
+    if let Some(out) = &args.out {
+        lines.push(format!("written: {}", out.join("attitude.csv").display()));
+    }
+    print(&lines.join("\n"))
 }
 
-fn print_summary(m: &AttitudeMetrics) {
-    println!("{} over {}", m.filter, m.log);
-    println!(
+fn summary(m: &AttitudeMetrics) -> Vec<String> {
+    let mut lines = vec![format!("{} over {}", m.filter, m.log)];
+    lines.push(format!(
         "{} samples in {:.1} s ({} with magnetic field, {} refused, {} gaps); {:.2} us a sample",
         m.samples,
         m.log_seconds,
@@ -74,27 +73,29 @@ fn print_summary(m: &AttitudeMetrics) {
         m.refused,
         m.gaps,
         m.step_time_ns * 1e-3
-    );
-    println!(
+    ));
+    lines.push(format!(
         "in gaps {:.1} s, at rest {:.1} s, magnetically disturbed {:.1} s, failed steps {}{}",
         m.gap_seconds,
         m.rest_seconds,
         m.disturbed_seconds,
         m.failed_steps,
         if m.interrupted { ", interrupted" } else { "" }
-    );
+    ));
     if let Some(limit) = m.gyro_limit {
-        println!(
+        lines.push(format!(
             "gyroscope at the end of its range ({:.2} rad/s, {:.0} deg/s) in {} samples, which are \
              taken for uncertain",
             limit,
             limit.to_degrees(),
             m.clipped_samples
-        );
+        ));
     }
     if let Some(last) = &m.last {
-        println!("at {:.3} s: quaternion (x y z w) {:.6?}", last.time, last.quaternion);
-        println!("  standard deviation {:.3?} deg", last.rotation_sd_deg);
-        println!("  gyro bias {:.6?} rad/s, s {:.1?}", last.gyro_bias, last.s);
+        let Reached { time, quaternion, rotation_sd_deg, gyro_bias, s } = last;
+        lines.push(format!("at {time:.3} s: quaternion (x y z w) {quaternion:.6?}"));
+        lines.push(format!("  standard deviation {rotation_sd_deg:.3?} deg"));
+        lines.push(format!("  gyro bias {gyro_bias:.6?} rad/s, s {s:.1?}"));
     }
+    lines
 }

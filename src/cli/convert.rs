@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
 use super::info::Setup;
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::dataset;
 
 /// Write any readable log as MCAP with ROS 2 messages, which Rerun and Foxglove open.
@@ -38,12 +38,14 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         }
     })?;
     bar.finish_and_clear();
+    let mut lines = String::new();
     for (topic, count) in &written.messages {
-        println!("{topic:<40} {count:>9}");
+        lines.push_str(&format!("{topic:<40} {count:>9}\n"));
     }
     for (reason, count) in &written.skipped {
-        println!("left out: {reason:<30} {count:>9}");
+        lines.push_str(&format!("left out: {reason:<30} {count:>9}\n"));
     }
+    print(&lines)?;
     anyhow::ensure!(
         !INTERRUPTED.load(Ordering::Relaxed),
         "interrupted; {} is complete up to there",

@@ -50,6 +50,5 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     for (name, figure) in figures(&replayed) {
         figure.save(&args.out.join(name).with_extension("png"))?;
     }
-    print_summary(&replayed.metrics, Some(&args.out));
-    Ok(())
+    print_summary(&replayed.metrics, Some(&args.out))
 }

@@ -1,12 +1,12 @@
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
 
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::evaluation::Table;
 use mfg_vio::experiment::{self, Report, Request, Row};
+use mfg_vio::output;
 
 /// Rerun a numerical study of the papers.
 #[derive(Debug, Args)]
@@ -41,7 +41,7 @@ pub fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
         for study in experiment::studies() {
             table.push([study.name.to_owned(), study.runs.to_string(), study.title.to_owned()]);
         }
-        return Ok(std::io::stdout().write_all(table.to_text().as_bytes())?);
+        return print(&table.to_text());
     }
     let name = args.name.as_deref().unwrap_or_default();
     let study = experiment::find(name).with_context(|| unknown(name))?;
@@ -57,7 +57,7 @@ pub fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
     if let Some(directory) = &args.out {
         write(&report, directory)?;
     }
-    let output = if args.json {
+    let text = if args.json {
         serde_json::to_string(&report)?
     } else {
         let (name, title) = (study.name, study.title);
@@ -65,14 +65,14 @@ pub fn run(args: &ExperimentArgs) -> anyhow::Result<()> {
         let lines = [heading, table(&report).to_text().trim_end().to_owned()];
         lines.into_iter().chain(report.notes).collect::<Vec<_>>().join("\n")
     };
-    Ok(writeln!(std::io::stdout(), "{output}")?)
+    print(&text)
 }
 
 /// `NAME.json`, and each figure as `NAME.svg` and `NAME.png`, numbered where there are several.
 fn write(report: &Report, directory: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(directory).with_context(|| directory.display().to_string())?;
     let path = directory.join(format!("{}.json", report.name));
-    std::fs::write(&path, serde_json::to_string(report)?)
+    output::write(&path, serde_json::to_string(report)?)
         .with_context(|| path.display().to_string())?;
     for (n, figure) in report.figures.iter().enumerate() {
         let number = if report.figures.len() > 1 { format!("-{}", n + 1) } else { String::new() };

@@ -1,11 +1,11 @@
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 use anyhow::Context;
 
 use super::replay::{Plan, Settings};
-use super::terminal::{INTERRUPTED, catch_interrupts};
+use super::results::Results;
+use super::terminal::{INTERRUPTED, catch_interrupts, print};
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Fault};
 use mfg_vio::evaluation::Table;
@@ -76,7 +76,7 @@ pub fn run(args: &FaultsArgs) -> anyhow::Result<()> {
         }))?,
         false => format!("{}\n\n{}", table(&outcomes).to_text().trim_end(), confused(&outcomes)),
     };
-    Ok(writeln!(std::io::stdout(), "{output}")?)
+    print(&output)
 }
 
 /// An error if there is a fault that never happens.
@@ -98,12 +98,14 @@ fn outcome(args: &FaultsArgs, fault: Option<&Fault>) -> anyhow::Result<FaultOutc
     let config = Config::for_log(&summary, file, args.settings.overrides())?;
     let config_origin =
         file.map_or_else(|| summary.config_name.clone(), |file| file.display().to_string());
+    let out = args.out.as_deref().map(|out| folder(out, fault));
+    out.as_deref().map_or(Ok(()), |out| Results::of("replay").remove(out))?;
     let plan = Plan {
         log: &args.log,
         settings: &args.settings,
         config,
         config_origin,
-        out: args.out.as_deref().map(|out| folder(out, fault)),
+        out,
         truth: args.truth.clone(),
         start: 0.0,
         duration: args.duration,

@@ -1,10 +1,9 @@
-use std::io::Write;
-
 use anyhow::Context;
 use clap::Args;
 use nalgebra::{Rotation3, Vector3};
 use serde::{Serialize, Serializer};
 
+use super::terminal::print;
 use mfg_vio::distribution::matrix_fisher::{MatrixFisher, Moments, s_from_d};
 use mfg_vio::evaluation::Table;
 use mfg_vio::so3::ProperSvd;
@@ -40,11 +39,11 @@ pub fn run(args: &FisherArgs) -> anyhow::Result<()> {
     let identity = Rotation3::identity();
     let fisher = MatrixFisher::from_svd(ProperSvd { u: identity, s, v: identity })?;
     let output = if args.json {
-        serde_json::to_string(&Summary::of(fisher.moments()))? + "\n"
+        serde_json::to_string(&Summary::of(fisher.moments()))?
     } else {
         text(&fisher)
     };
-    Ok(std::io::stdout().write_all(output.as_bytes())?)
+    print(&output)
 }
 
 fn vector(values: &[f64]) -> Vector3<f64> {

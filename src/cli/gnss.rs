@@ -1,3 +1,4 @@
+use std::fmt::{self, Write};
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -6,7 +7,7 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::dataset::{read_imu_table, read_position_table};
 use mfg_vio::evaluation::{NeesSummary, Table};
 use mfg_vio::filter::gnss::{
@@ -208,11 +209,10 @@ pub fn run(args: &GnssArgs) -> anyhow::Result<()> {
     });
     let report = report(args, kind, &summary, rival);
     if args.json {
-        println!("{}", serde_json::to_string(&report)?);
+        print(&serde_json::to_string(&report)?)
     } else {
-        print(&report, &config);
+        print(&text(&report, &config)?)
     }
-    Ok(())
 }
 
 /// A run with a progress bar that ends when interrupted.
@@ -279,26 +279,32 @@ fn report(
     }
 }
 
-fn print(report: &Report, config: &GnssConfig) {
-    println!("filter                {} ({})", report.filter, report.config);
-    println!("first fix             {:.3} s", report.start);
-    println!(
+fn text(report: &Report, config: &GnssConfig) -> Result<String, fmt::Error> {
+    let mut out = String::new();
+    writeln!(out, "filter                {} ({})", report.filter, report.config)?;
+    writeln!(out, "first fix             {:.3} s", report.start)?;
+    writeln!(
+        out,
         "IMU samples, gaps     {}, {} and {} filled in",
         report.imu_samples, report.gaps, report.interpolated
-    );
-    println!(
+    )?;
+    writeln!(
+        out,
         "fixes                 {} used, {} rejected, {} a surprise",
         report.fixes_used, report.fixes_rejected, report.surprises
-    );
+    )?;
     let limit = config.start.converged_heading_sd;
     match report.heading_converged_s {
-        Some(t) => println!("heading               within {limit} deg (1 sigma) after {t:.2} s"),
-        None => println!("heading               never within {limit} deg (1 sigma)"),
+        Some(t) => {
+            writeln!(out, "heading               within {limit} deg (1 sigma) after {t:.2} s")?;
+        }
+        None => writeln!(out, "heading               never within {limit} deg (1 sigma)")?,
     }
     for (what, nis) in [("NIS", &report.nis), ("NIS, heading known", &report.nis_after_convergence)]
     {
         let Some(nis) = nis else { continue };
-        println!(
+        writeln!(
+            out,
             "{what:<22}mean {:.2} (95 % bounds {:.2} to {:.2}), median {:.2}, {:.1} % of {} in [{:.2}, {:.2}], {:.1} % above",
             nis.mean,
             nis.mean_bounds[0],
@@ -309,11 +315,18 @@ fn print(report: &Report, config: &GnssConfig) {
             nis.bounds[0],
             nis.bounds[1],
             100.0 * nis.above,
-        );
+        )?;
     }
-    if report.outages.is_empty() {
-        return;
+    if !report.outages.is_empty() {
+        if let Some(Rival::Failed { error }) = &report.mekf {
+            writeln!(out, "mekf failed: {error}")?;
+        }
+        out.push_str(&outage_table(report).to_text());
     }
+    Ok(out)
+}
+
+fn outage_table(report: &Report) -> Table {
     let mut table = Table::new([
         "outage from, s",
         "filter",
@@ -337,10 +350,8 @@ fn print(report: &Report, config: &GnssConfig) {
         }
     };
     add(report.filter, &report.outages);
-    match &report.mekf {
-        Some(Rival::Finished { outages, .. }) => add("mekf", outages),
-        Some(Rival::Failed { error }) => println!("mekf failed: {error}"),
-        None => {}
+    if let Some(Rival::Finished { outages, .. }) = &report.mekf {
+        add("mekf", outages);
     }
-    print!("{}", table.to_text());
+    table
 }

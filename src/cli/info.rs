@@ -1,6 +1,7 @@
-use std::io::{self, Write};
+use std::fmt::{self, Write};
 use std::path::PathBuf;
 
+use super::terminal::print;
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Assumed, Inspection, LogSummary, Severity, TopicInspection};
 use mfg_vio::sensor::CameraConfig;
@@ -50,21 +51,19 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     let body_from_camera = camera.and_then(CameraConfig::imu_from_camera);
     let assumed = Assumed { log: &config.log, imu: &config.imu, body_from_camera };
     let inspection = dataset::inspect(&args.log, &assumed)?;
-    let mut out = io::stdout().lock();
     if args.json {
-        serde_json::to_writer_pretty(&mut out, &inspection)?;
-        writeln!(out)?;
-        return Ok(());
+        return print(&serde_json::to_string_pretty(&inspection)?);
     }
     let name = match &args.setup.config {
         Some(path) => path.display().to_string(),
         None => format!("configs/{}.toml", summary.config_name),
     };
-    print(&mut out, &inspection, &name)?;
-    Ok(())
+    let mut text = String::new();
+    describe(&mut text, &inspection, &name)?;
+    print(&text)
 }
 
-fn print(out: &mut impl Write, inspection: &Inspection, config: &str) -> io::Result<()> {
+fn describe(out: &mut String, inspection: &Inspection, config: &str) -> fmt::Result {
     writeln!(out, "{}, {:.2} s; read with {config}", inspection.summary.kind, inspection.duration)?;
     for (role, source) in &inspection.summary.sources {
         writeln!(out, "  {role:<6} {source}")?;
@@ -90,7 +89,7 @@ fn print(out: &mut impl Write, inspection: &Inspection, config: &str) -> io::Res
     writeln!(out, "\nverdict: {}", inspection.verdict.text)
 }
 
-fn row(out: &mut impl Write, name: &str, topic: &TopicInspection) -> io::Result<()> {
+fn row(out: &mut String, name: &str, topic: &TopicInspection) -> fmt::Result {
     let timing = topic.timing.as_ref();
     let rate = timing.and_then(|t| t.rate).map_or("-".to_owned(), |rate| format!("{rate:.2}"));
     let count = |of: fn(&dataset::Timing) -> usize| {

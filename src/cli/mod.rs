@@ -10,18 +10,21 @@ mod evaluate;
 mod experiment;
 #[cfg(feature = "vision")]
 mod faults;
+mod files;
 mod fisher;
 mod gnss;
 mod info;
 #[cfg(feature = "vision")]
 mod replay;
+mod results;
 mod simulate;
 mod terminal;
 
-use std::io::ErrorKind;
+use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use mfg_vio::output::FilesError;
 
 /// Visual-inertial odometry whose beliefs about attitude live on SO(3) itself.
 #[derive(Debug, Parser)]
@@ -54,11 +57,51 @@ enum Command {
     Gnss(gnss::GnssArgs),
 }
 
-/// Parses the command line and runs it: exit status 0, 1 after a failure, 2 on wrong usage.
+/// The command line contradicts itself in a way that its grammar does not tell.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct WrongUsage(pub String);
+
+/// Parses the command line and runs it: exit status 0, 1 after a failure, 2 on wrong usage,
+/// 128 + n after signal n.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let command = Cli::command();
+    let arguments = with_whole_numbers(std::env::args_os());
+    let parsed = command
+        .clone()
+        .try_get_matches_from(arguments)
+        .and_then(|matches| Cli::from_arg_matches(&matches).map(|cli| (matches, cli)));
+    let (matches, cli) = match parsed {
+        Ok(parsed) => parsed,
+        Err(error) => return explain(&error),
+    };
     terminal::start_messages(cli.verbose);
-    let done = match cli.command {
+    let done = files::prepare(&command, &matches).and_then(|()| run(cli.command));
+    if let Err(error) = &done {
+        terminal::tell(&format!("mfg-vio: {}", in_one_line(error)));
+    }
+    match (terminal::interruption_status(), done) {
+        (Some(status), _) => status.into(),
+        (None, Ok(())) => ExitCode::SUCCESS,
+        (None, Err(error)) if is_wrong_usage(&error) => ExitCode::from(2),
+        (None, Err(_)) => ExitCode::FAILURE,
+    }
+}
+
+/// Puts the zero before the point of `-.5`, which the parser would take for a flag.
+fn with_whole_numbers(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
+    let whole = |argument: OsString| {
+        let digits = argument.to_str().and_then(|text| text.strip_prefix("-."));
+        match digits.filter(|digits| digits.starts_with(|c: char| c.is_ascii_digit())) {
+            Some(digits) => format!("-0.{digits}").into(),
+            None => argument,
+        }
+    };
+    arguments.map(whole).collect()
+}
+
+fn run(command: Command) -> anyhow::Result<()> {
+    match command {
         #[cfg(feature = "vision")]
         Command::Demo(args) => demo::run(&args),
         #[cfg(feature = "vision")]
@@ -75,14 +118,14 @@ pub fn main() -> ExitCode {
         Command::Experiment(args) => experiment::run(&args),
         Command::Fisher(args) => fisher::run(&args),
         Command::Gnss(args) => gnss::run(&args),
-    };
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("mfg-vio: {}", in_one_line(&error));
-            ExitCode::FAILURE
-        }
+    }
+}
+
+/// Prints what is wrong with the command line, or the help that it asks for.
+fn explain(error: &clap::Error) -> ExitCode {
+    match (error.print(), u8::try_from(error.exit_code())) {
+        (Ok(()), Ok(status)) => status.into(),
+        _ => ExitCode::FAILURE,
     }
 }
 
@@ -97,8 +140,7 @@ fn in_one_line(error: &anyhow::Error) -> String {
     line
 }
 
-/// A reader that went away (`| head`) is no failure.
-fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    let io = error.chain().find_map(|cause| cause.downcast_ref::<std::io::Error>());
-    io.is_some_and(|io| io.kind() == ErrorKind::BrokenPipe)
+fn is_wrong_usage(error: &anyhow::Error) -> bool {
+    let files = error.downcast_ref::<FilesError>();
+    error.is::<WrongUsage>() || files.is_some_and(FilesError::is_wrong_usage)
 }

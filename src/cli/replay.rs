@@ -4,7 +4,7 @@ use anyhow::Context;
 use indicatif::ProgressBar;
 use nalgebra::Isometry3;
 
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::config::Config;
 use mfg_vio::dataset::{self, Fault, LogSummary};
 use mfg_vio::filter::{FilterKind, MapTreatment};
@@ -125,11 +125,10 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     };
     let replayed = plan.execute()?;
     if args.json {
-        println!("{}", serde_json::to_string(&replayed.metrics)?);
+        print(&serde_json::to_string(&replayed.metrics)?)
     } else {
-        print_summary(&replayed.metrics, args.out.as_deref());
+        print_summary(&replayed.metrics, args.out.as_deref())
     }
-    Ok(())
 }
 
 fn load_config(args: &Args, summary: &LogSummary) -> anyhow::Result<(Config, String)> {
@@ -320,11 +319,13 @@ impl Observer for Recording {
 }
 
 /// The result table on stdout.
-pub fn print_summary(metrics: &Metrics, out: Option<&std::path::Path>) {
+pub fn print_summary(metrics: &Metrics, out: Option<&std::path::Path>) -> anyhow::Result<()> {
+    let mut lines = String::new();
     for (what, value) in metrics.summary() {
-        println!("{what:<26} {value}");
+        lines.push_str(&format!("{what:<26} {value}\n"));
     }
     if let Some(out) = out {
-        println!("{:<26} {}", "results in", out.display());
+        lines.push_str(&format!("{:<26} {}\n", "results in", out.display()));
     }
+    print(&lines)
 }

@@ -4,8 +4,9 @@ use std::sync::atomic::Ordering;
 
 use clap::Args;
 
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::dataset::{LogWriter, WriteSummary};
+use mfg_vio::output::Files;
 use mfg_vio::sensor::Event;
 use mfg_vio::simulation::{SceneConfig, Simulation};
 
@@ -72,16 +73,20 @@ pub fn run(args: SimulateArgs) -> anyhow::Result<()> {
     }
     scene.duration = args.duration.unwrap_or(scene.duration);
     scene.seed = args.seed.unwrap_or(scene.seed);
+    if !scene.trajectory.file.as_os_str().is_empty() {
+        // It may be the scene file that names it.
+        let mut files = Files::new();
+        files.reads("trajectory", &scene.trajectory.file).writes("--out", &args.out).check()?;
+    }
     catch_interrupts()?;
     let summary = render(scene, &args.out)?;
-    println!(
+    print(&format!(
         "{}: {} frames, {} IMU samples, {} truth poses",
         args.out.display(),
         summary.frames,
         summary.imu_samples,
         summary.truth_poses
-    );
-    Ok(())
+    ))
 }
 
 /// Writes the log of a scene; an interrupted one is complete up to there.

@@ -21,6 +21,7 @@ use super::{
     Event, LogConfig, LogError, LogWriter, LogWriterOptions, ReadReport, WriteError, open,
 };
 use crate::inertial::ImuConfig;
+use crate::output::{Files, FilesError};
 use crate::sensor::CameraConfig;
 
 /// Level of the zstd compression: images hardly shrink further with higher ones.
@@ -42,8 +43,8 @@ pub enum ConvertError {
     Read(#[from] LogError),
     #[error(transparent)]
     Write(#[from] WriteError),
-    #[error("{}: it would be overwritten while it is read; give another name for the output", .0.display())]
-    SameFile(std::path::PathBuf),
+    #[error(transparent)]
+    Files(#[from] FilesError),
 }
 
 /// Writes the log `input` as MCAP to `output`. `camera` goes with the images of folders
@@ -60,10 +61,7 @@ pub fn convert(
     progress: impl FnMut() -> ControlFlow<()>,
 ) -> Result<ConvertSummary, ConvertError> {
     log.validate()?;
-    let same = |a: &Path, b: &Path| Some(a.canonicalize().ok()? == b.canonicalize().ok()?);
-    if same(input, output) == Some(true) {
-        return Err(ConvertError::SameFile(output.to_owned()));
-    }
+    Files::new().reads("IN", input).writes("OUT", output).check()?;
     match Contents::of(input, log)? {
         Contents::Messages(messages) if !is_stereo(&messages, log) => {
             convert_messages(&messages, output, log, progress)

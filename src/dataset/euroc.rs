@@ -7,9 +7,12 @@ use std::path::{Path, PathBuf};
 use nalgebra::Vector3;
 
 use super::folder::{Entry, Listing, read_text};
+use super::imu_csv::imu_columns;
 use super::message::isometry;
 use super::pixels::Rejection;
+use super::text_table::Row;
 use super::{LogConfig, LogError, LogSummary, TruthPose};
+use crate::dialect::{Dialect, PoseColumns, TimeUnit};
 use crate::sensor::{CameraConfig, ImuSample, Stamp};
 use crate::vision::StereoRig;
 
@@ -17,6 +20,8 @@ const LEFT: &str = "cam0";
 const RIGHT: &str = "cam1";
 const IMU: &str = "imu0";
 const TRUTH: &str = "state_groundtruth_estimate0";
+/// The table in each sensor's folder.
+const ROWS: &str = "data.csv";
 
 /// The folder that holds the sensors' folders.
 fn root(folder: &Path) -> PathBuf {
@@ -37,10 +42,13 @@ pub(super) fn list(folder: &Path, config: &LogConfig) -> Result<(LogSummary, Lis
         reason: format!("{LEFT} and {RIGHT}: {error}"),
     })?;
     let mut listing = Listing::default();
-    let image = |name: &str, path: &str| root.join(name).join("data").join(path.trim());
-    read_rows(&root, LEFT, &mut listing, |_, row| Ok(Entry::Color(image(LEFT, row))))?;
-    read_rows(&root, RIGHT, &mut listing, |_, row| Ok(Entry::Right(image(RIGHT, row))))?;
-    let has = |name: &str, topic: &str| topic != "none" && root.join(name).is_dir();
+    let image = |name: &str, row: &Row| match row.field(1) {
+        Ok(file) => Ok(root.join(name).join("data").join(file)),
+        Err(detail) => Err(Rejection::new("no file name", detail)),
+    };
+    read_rows(&root, LEFT, &mut listing, |_, row, _| Ok(Entry::Color(image(LEFT, row)?)))?;
+    read_rows(&root, RIGHT, &mut listing, |_, row, _| Ok(Entry::Right(image(RIGHT, row)?)))?;
+    let has = |name: &str, topic: &str| topic != "none" && has_rows(&root.join(name));
     let (has_imu, has_truth) = (has(IMU, &config.imu_topic), has(TRUTH, &config.truth_topic));
     if has_imu {
         read_rows(&root, IMU, &mut listing, imu)?;
@@ -64,26 +72,37 @@ pub(super) fn list(folder: &Path, config: &LogConfig) -> Result<(LogSummary, Lis
     Ok((summary, listing))
 }
 
-/// Reads the rows `stamp,rest` of a sensor's `data.csv`.
+/// Whether an optional sensor is there; a folder of it without its rows is worth a word.
+fn has_rows(sensor: &Path) -> bool {
+    let rows = sensor.join(ROWS);
+    if sensor.is_dir() && !rows.is_file() {
+        tracing::warn!("{}: is not there; the log is read without it", rows.display());
+    }
+    rows.is_file()
+}
+
+/// Reads the rows of a sensor's `data.csv`: stamps in ns, unless they have a decimal point.
+/// `read` is given the line of names, too.
 fn read_rows(
     root: &Path,
     sensor: &str,
     listing: &mut Listing,
-    read: impl Fn(Stamp, &str) -> Result<Entry, Rejection>,
+    read: impl Fn(Stamp, &Row, Option<&str>) -> Result<Entry, Rejection>,
 ) -> Result<(), LogError> {
-    let text = read_text(&root.join(sensor).join("data.csv"))?;
-    for (number, line) in text.lines().enumerate() {
+    let text = read_text(&root.join(sensor).join(ROWS))?;
+    let (mut names, mut layout) = (None, None);
+    for (number, line) in text.trim_start_matches('\u{feff}').lines().enumerate() {
         let line = line.trim();
-        if line.is_empty() || line.starts_with('#') {
+        if line.is_empty() || line.starts_with('#') || layout.is_none() && is_header(line) {
+            names = names.or(Some(line));
             continue;
         }
-        let (stamp, rest) = line.split_once(',').unwrap_or((line, ""));
-        let entry = stamp
-            .trim()
-            .parse()
-            .map_err(|_| Rejection::new("no time stamp", stamp))
-            .map(Stamp::from_nanos)
-            .and_then(|stamp| Ok((stamp, read(stamp, rest)?)));
+        let (dialect, unit) = *layout.get_or_insert_with(|| layout_of(line));
+        let row = Row::new(line, dialect, unit);
+        let entry = row
+            .stamp(0)
+            .map_err(|reason| Rejection::new("no time stamp", reason))
+            .and_then(|stamp| Ok((stamp, read(stamp, &row, names)?)));
         match entry {
             Ok(entry) => listing.entries.push(entry),
             Err(Rejection { reason, detail }) => listing
@@ -92,6 +111,17 @@ fn read_rows(
         }
     }
     Ok(())
+}
+
+fn is_header(line: &str) -> bool {
+    line.starts_with(|c: char| c.is_alphabetic() || c == '"')
+}
+
+fn layout_of(line: &str) -> (Dialect, TimeUnit) {
+    let dialect = Dialect::of(line);
+    let stamp = dialect.fields(line).next().unwrap_or_default();
+    let is_decimal = dialect.plain(stamp).contains('.');
+    (dialect, if is_decimal { TimeUnit::Seconds } else { TimeUnit::Nanoseconds })
 }
 
 /// The first `N` of comma-separated numbers.
@@ -103,20 +133,35 @@ fn numbers<const N: usize>(text: &str) -> Result<[f64; N], Rejection> {
         .ok_or_else(|| Rejection::new("not the numbers that belong here", text))
 }
 
-/// `wx,wy,wz` (rad/s), `ax,ay,az` (m/s^2).
-fn imu(stamp: Stamp, row: &str) -> Result<Entry, Rejection> {
-    let [wx, wy, wz, ax, ay, az] = numbers(row)?;
+/// Three numbers.
+fn vector(row: &Row, columns: [usize; 3]) -> Result<Vector3<f64>, Rejection> {
+    let wrong = |detail: String| Rejection::new("not the numbers that belong here", detail);
+    let vector = row.vector(columns).map_err(wrong)?;
+    match vector.iter().all(|x| x.is_finite()) {
+        true => Ok(vector),
+        false => Err(wrong("not finite".to_owned())),
+    }
+}
+
+/// Angular velocity (rad/s) and specific force (m/s^2), in the order that `names` tells, else in
+/// this.
+fn imu(stamp: Stamp, row: &Row, names: Option<&str>) -> Result<Entry, Rejection> {
+    let named = names.and_then(imu_columns);
+    let [_, wx, wy, wz, ax, ay, az] = named.unwrap_or([0, 1, 2, 3, 4, 5, 6]);
     Ok(Entry::Imu(ImuSample {
         stamp,
-        angular_velocity: Vector3::new(wx, wy, wz),
-        specific_force: Vector3::new(ax, ay, az),
+        angular_velocity: vector(row, [wx, wy, wz])?,
+        specific_force: vector(row, [ax, ay, az])?,
     }))
 }
 
-/// `px,py,pz,qw,qx,qy,qz` of the IMU.
-fn truth(stamp: Stamp, row: &str) -> Result<Entry, Rejection> {
-    let [px, py, pz, w, x, y, z] = numbers(row)?;
-    let world_from_body = isometry([px, py, pz].into(), [x, y, z, w])?;
+/// Position and quaternion of the IMU, in the order that `names` tells, else w first.
+fn truth(stamp: Stamp, row: &Row, names: Option<&str>) -> Result<Entry, Rejection> {
+    let named = names.and_then(PoseColumns::named).map(|named| named.columns);
+    let [_, px, py, pz, qx, qy, qz, qw] = named.unwrap_or([0, 1, 2, 3, 5, 6, 7, 4]);
+    let [x, y, z]: [f64; 3] = vector(row, [qx, qy, qz])?.into();
+    let w = vector(row, [qw; 3])?.x;
+    let world_from_body = isometry(vector(row, [px, py, pz])?, [x, y, z, w])?;
     Ok(Entry::Truth(TruthPose { stamp, world_from_body }))
 }
 

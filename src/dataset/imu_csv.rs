@@ -6,9 +6,11 @@ use std::path::Path;
 use nalgebra::Vector3;
 
 use super::LogError;
-use super::text_table::{Row, TextTable, fields};
-use crate::sensor::ImuSample;
+use super::text_table::{Row, TextTable, check_step};
+use crate::dialect::{Dialect, TimeUnit, axis_of, is_stamp};
+use crate::sensor::{ImuSample, Stamp};
 
+/// Our names of the columns.
 const COLUMNS: [&str; 10] = ["t", "gx", "gy", "gz", "ax", "ay", "az", "mx", "my", "mz"];
 /// Columns that must be there.
 const INERTIAL_COLUMNS: usize = 7;
@@ -29,40 +31,91 @@ pub struct ImuRow {
 #[derive(Debug)]
 pub struct ImuCsv {
     table: TextTable,
-    /// Position of each of [`COLUMNS`]; found at the first line.
-    positions: Option<Vec<usize>>,
+    /// Found at the first lines.
+    layout: Option<Layout>,
+    /// Of the line of names, if there was one.
+    names: Option<Names>,
+    last: Option<Stamp>,
     failed: bool,
+}
+
+/// What a line of names says: positions of [`COLUMNS`] and unit of the stamps.
+#[derive(Debug)]
+struct Names {
+    positions: Vec<usize>,
+    unit: Option<TimeUnit>,
 }
 
 impl ImuCsv {
     /// # Errors
     /// [`LogError::Io`] if the file cannot be opened.
     pub fn open(path: &Path) -> Result<Self, LogError> {
-        Ok(Self { table: TextTable::open(path)?, positions: None, failed: false })
+        let table = TextTable::open(path)?;
+        Ok(Self { table, layout: None, names: None, last: None, failed: false })
+    }
+
+    /// The error that the last row is wrong.
+    pub(super) fn wrong_row(&self, reason: &str) -> LogError {
+        self.table.wrong_line(reason)
     }
 
     fn next_row(&mut self) -> Result<Option<ImuRow>, LogError> {
         while let Some(line) = self.table.next_line()? {
-            if line.starts_with('#') {
-                continue;
-            }
             let here = |reason: String| self.table.wrong_line(&reason);
-            let fields = fields(&line);
-            let positions = match &self.positions {
-                Some(positions) => positions,
+            let layout = match &self.layout {
+                _ if line.starts_with('#') && !names_columns(&line) => continue,
+                Some(layout) => layout,
+                None if self.names.is_none() && names_columns(&line) => {
+                    self.names = Some(Names::of(&line).map_err(here)?);
+                    continue;
+                }
                 None => {
-                    let named = fields.first().is_some_and(|first| first.parse::<f64>().is_err());
-                    let positions = if named { by_name(&fields) } else { in_order(&fields) };
-                    let positions = self.positions.insert(positions.map_err(here)?);
-                    if named {
-                        continue;
-                    }
-                    positions
+                    let layout = Layout::of(&line, self.names.take()).map_err(here)?;
+                    self.layout.insert(layout)
                 }
             };
-            return row(&Row(&fields), positions).map(Some).map_err(here);
+            let row = row(&layout.row(&line), &layout.positions).map_err(here)?;
+            check_step(self.last, row.imu.stamp).map_err(here)?;
+            self.last = Some(row.imu.stamp);
+            return Ok(Some(row));
         }
         Ok(None)
+    }
+}
+
+impl Names {
+    fn of(line: &str) -> Result<Self, String> {
+        let names: Vec<&str> = header_fields(line).collect();
+        let positions = by_name(&names)?;
+        let stamp = positions.first().and_then(|k| names.get(*k));
+        Ok(Self { unit: stamp.and_then(|name| TimeUnit::of_name(name)), positions })
+    }
+}
+
+/// How the rows are written.
+#[derive(Debug)]
+struct Layout {
+    dialect: Dialect,
+    unit: TimeUnit,
+    positions: Vec<usize>,
+}
+
+impl Layout {
+    /// Of the first row, with what the line of names said.
+    fn of(line: &str, names: Option<Names>) -> Result<Self, String> {
+        let dialect = Dialect::of(line);
+        let fields: Vec<&str> = dialect.fields(line).collect();
+        let Names { positions, unit } = match names {
+            Some(names) => names,
+            None => Names { positions: in_order(&fields)?, unit: None },
+        };
+        let stamp = positions.first().and_then(|k| fields.get(*k)).unwrap_or(&"");
+        let unit = unit.unwrap_or_else(|| TimeUnit::of_stamp(stamp));
+        Ok(Self { dialect, unit, positions })
+    }
+
+    fn row<'a>(&self, line: &'a str) -> Row<'a> {
+        Row::new(line, self.dialect, self.unit)
     }
 }
 
@@ -79,9 +132,43 @@ impl Iterator for ImuCsv {
     }
 }
 
+/// Names by which programs know the columns: ours, of EuRoC, of `rostopic echo -p`, of words.
+/// Of the angular velocity, the specific force and the magnetic field.
+const SPELLINGS: [&[&str]; 3] = [
+    &["g", "gyro", "gyr", "w", "omega", "w_rs_s", "angular_velocity"],
+    &["a", "acc", "accel", "a_rs_s", "linear_acceleration"],
+    &["m", "mag", "magnetic_field"],
+];
+
+/// Index into [`COLUMNS`] of a column of this name.
+fn column(name: &str) -> Option<usize> {
+    if is_stamp(name) {
+        return Some(0);
+    }
+    let (axis, stem) = axis_of(name)?;
+    let stem = stem.rsplit('.').next()?;
+    let group = SPELLINGS.iter().position(|stems| stems.contains(&stem))?;
+    let axis = ['x', 'y', 'z'].iter().position(|known| *known == axis)?;
+    Some(1 + 3 * group + axis)
+}
+
+fn header_fields(line: &str) -> impl Iterator<Item = &str> {
+    let line = line.trim_start_matches(['#', ' ']);
+    Dialect::of(line).fields(line)
+}
+
+/// Whether a line names columns, perhaps behind a `#`.
+fn names_columns(line: &str) -> bool {
+    let known = header_fields(line).filter(|name| column(name).is_some()).count();
+    let is_number = |field: &str| Dialect::of(line).number(field).is_some();
+    let is_text = header_fields(line).next().is_some_and(|first| !is_number(first));
+    known >= INERTIAL_COLUMNS || is_text && !line.starts_with('#')
+}
+
 fn by_name(names: &[&str]) -> Result<Vec<usize>, String> {
-    let position = |column: &&str| names.iter().position(|name| name == column);
-    let positions: Vec<usize> = COLUMNS.iter().map_while(position).collect();
+    let found: Vec<Option<usize>> = names.iter().map(|name| column(name)).collect();
+    let position = |k: usize| found.iter().position(|column| *column == Some(k));
+    let positions: Vec<usize> = (0..COLUMNS.len()).map_while(position).collect();
     match COLUMNS.get(positions.len()) {
         Some(missing) if positions.len() < INERTIAL_COLUMNS => Err(format!(
             "no column `{missing}` in `{}`; the columns are {}",
@@ -93,6 +180,12 @@ fn by_name(names: &[&str]) -> Result<Vec<usize>, String> {
         }
         _ => Ok(positions),
     }
+}
+
+/// Positions of stamp, angular velocity and specific force, if `line` names all of them.
+pub(super) fn imu_columns(line: &str) -> Option<[usize; INERTIAL_COLUMNS]> {
+    let names: Vec<&str> = header_fields(line).collect();
+    by_name(&names).ok()?.get(..INERTIAL_COLUMNS)?.try_into().ok()
 }
 
 fn in_order(fields: &[&str]) -> Result<Vec<usize>, String> {
@@ -145,6 +238,31 @@ mod tests {
     }
 
     #[test]
+    fn the_same_rows_in_every_spelling() {
+        let numbers = "1403715524.5,1,2,3,4,5,6.5\n1403715524.505,1,-.5,3,4,5,6\n";
+        let expected = read(numbers).unwrap();
+        let nanoseconds =
+            numbers.replace("524.505", "524505000000").replace("524.5", "524500000000");
+        let swapped = "1403715524500000000,4,5,6.5,1,2,3\n1403715524505000000,4,5,6,1,-.5,3\n";
+        let semicolons = numbers.replace(',', ";").replace('.', ",");
+        for content in [
+            numbers.replace(',', " "),
+            numbers.replace(',', "\t").replace('.', ","),
+            semicolons.clone(),
+            format!("t;gx;gy;gz;ax;ay;az\n{semicolons}"),
+            format!("\u{feff}t,gx,gy,gz,ax,ay,az\r\n{}", numbers.replace('\n', "\r\n")),
+            nanoseconds.clone(),
+            format!("%time,w.x,w.y,w.z,field.linear_acceleration.x,acc_y,aZ\n{nanoseconds}"),
+            format!(
+                "#timestamp [ns],a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2],\
+                 w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1]\n{swapped}"
+            ),
+        ] {
+            assert_eq!(read(&content).as_ref(), Ok(&expected), "{content}");
+        }
+    }
+
+    #[test]
     fn a_slow_magnetometer_leaves_fields_empty() {
         let rows = read("0,1,2,3,4,5,6,7e-6,8e-6,9e-6\n0.01,1,2,3,4,5,6,,,\n").unwrap();
         assert_eq!(rows[0].magnetic_field, Some(Vector3::new(7e-6, 8e-6, 9e-6)));
@@ -161,6 +279,9 @@ mod tests {
             ("0,1,2,3,4,5,six\n", "line 1: `six` is no number"),
             ("0,1,2,3,4,5,6,7,8,north\n", "line 1: `north` is no number"),
             ("1e300,1,2,3,4,5,6\n", "line 1: `1e300` is no time in s"),
+            ("5,1,2,3,4,5,6\n5000005,1,2,3,4,5,6\n", "line 2: 5000000 s from the line before"),
+            ("t,gx,gy,gz,ax,ay,az\n0.5,1,2,3,4,5,6\n1403715524907143168,1,2,3,4,5,6\n", "line 3"),
+            ("0,5,1,2,3,4,5,6,0,1,2,3,4,5\n", "line 1: 14 fields"),
         ] {
             let error = read(content).unwrap_err();
             assert!(error.contains(expected) && error.contains("imu.csv"), "{error}");

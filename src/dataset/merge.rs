@@ -83,6 +83,36 @@ const LONGEST_STEP: f64 = 10.0;
 /// Readings wait for stragglers in at most this much memory, bytes.
 const LARGEST_BUFFER: usize = 256 << 20;
 
+/// All readings late over this time (s), and as many, mean that all clocks were set back.
+const SET_BACK_SECONDS: f64 = 0.1;
+const SET_BACK_READINGS: usize = 5;
+
+/// Readings in a row that came too late: stragglers, unless all that follows is late, too.
+#[derive(Default)]
+struct Late(Vec<Reading>);
+
+impl Late {
+    /// Holds a reading; those that a straggler of its stream makes stragglers come back.
+    fn hold(&mut self, reading: Reading) -> Vec<Reading> {
+        let same = |held: &&Reading| held.stream() == reading.stream();
+        let last = self.0.iter().rev().find(same).map(Reading::stamp);
+        let stragglers = match last.is_some_and(|last| reading.stamp() <= last) {
+            true => std::mem::take(&mut self.0),
+            false => Vec::new(),
+        };
+        self.0.push(reading);
+        stragglers
+    }
+
+    /// Whether they go on as if nothing had been before.
+    fn is_new_run(&self) -> bool {
+        let stamps = || self.0.iter().map(Reading::stamp);
+        let span =
+            stamps().max().zip(stamps().min()).map(|(last, first)| last.seconds_since(first));
+        self.0.len() >= SET_BACK_READINGS && span.is_some_and(|span| span >= SET_BACK_SECONDS)
+    }
+}
+
 /// Orders readings by stamp in a buffer of bounded time and memory, and pairs the images.
 pub(super) struct MergedLog<S> {
     source: S,
@@ -90,6 +120,7 @@ pub(super) struct MergedLog<S> {
     report: ReadReport,
     gates: [StampGate; STREAMS.len()],
     buffer: ReorderBuffer,
+    late: Late,
     finished: bool,
 }
 
@@ -101,11 +132,39 @@ impl<S: ReadingSource> MergedLog<S> {
             report: ReadReport::default(),
             gates: Default::default(),
             buffer: ReorderBuffer::new(config),
+            late: Late::default(),
             finished: false,
         }
     }
 
+    /// Takes a reading; where all that comes is late from some point on, the clocks were set back:
+    /// what was before is released, and the stamps begin anew.
     fn accept(&mut self, reading: Reading) {
+        if !self.buffer.is_late(reading.stamp()) {
+            self.drop_late();
+            self.order(reading);
+            return;
+        }
+        for straggler in self.late.hold(reading) {
+            self.buffer.add(straggler, &mut self.report);
+        }
+        if self.late.is_new_run() {
+            self.release_all();
+            self.gates = Default::default();
+            self.buffer.begin_anew();
+            let first = std::mem::take(&mut self.late);
+            first.0.into_iter().for_each(|reading| self.order(reading));
+        }
+    }
+
+    /// Stragglers are counted.
+    fn drop_late(&mut self) {
+        for straggler in std::mem::take(&mut self.late).0 {
+            self.buffer.add(straggler, &mut self.report);
+        }
+    }
+
+    fn order(&mut self, reading: Reading) {
         let stream = reading.stream();
         for reading in self.gates[stream].pass(reading, &mut self.report) {
             self.buffer.add(reading, &mut self.report);
@@ -116,6 +175,11 @@ impl<S: ReadingSource> MergedLog<S> {
 
     fn finish(&mut self) {
         self.finished = true;
+        self.drop_late();
+        self.release_all();
+    }
+
+    fn release_all(&mut self) {
         for gate in &mut self.gates {
             if let Some(reading) = gate.finish(&mut self.report) {
                 self.buffer.add(reading, &mut self.report);
@@ -232,9 +296,18 @@ impl ReorderBuffer {
         }
     }
 
+    fn is_late(&self, stamp: Stamp) -> bool {
+        self.released.is_some_and(|released| stamp <= released)
+    }
+
+    /// Forgets which stamps there were; everything must have been released.
+    fn begin_anew(&mut self) {
+        (self.latest, self.released) = (Stamp::from_nanos(i64::MIN), None);
+    }
+
     fn add(&mut self, reading: Reading, report: &mut ReadReport) {
         let (stamp, size, stream) = (reading.stamp(), reading.size(), STREAMS[reading.stream()]);
-        if self.released.is_some_and(|released| stamp <= released) {
+        if self.is_late(stamp) {
             let reason = format!("{stream}: out of order beyond the reorder window, or repeated");
             report.skip_at(&reason, stamp);
             return;
@@ -449,6 +522,41 @@ mod tests {
         assert_eq!(events.len(), 5);
         assert_eq!(skipped["imu: out of order beyond the reorder window, or repeated"], 1);
         assert_eq!(merge(readings, 1.0).0.len(), 6);
+    }
+
+    #[test]
+    fn clocks_that_are_set_begin_anew() {
+        // Two streams at 100 Hz and 10 Hz, by 1 s back and by an hour ahead after 2 s.
+        for jump in [-1000, -3_600_000, 3_600_000] {
+            let clock = |millis: i64| if millis > 2000 { millis + jump } else { millis };
+            let mut readings = Vec::new();
+            for millis in (0..4000).step_by(10) {
+                readings.push(imu(clock(millis)));
+                if millis % 100 == 0 {
+                    readings.extend([color(clock(millis), 2), depth(clock(millis), 2)]);
+                }
+            }
+            let (events, skipped) = merge(readings, 0.5);
+            assert_eq!((events.len(), skipped.len()), (440, 0), "{jump}");
+            let jumps: Vec<_> = events
+                .windows(2)
+                .map(|w| w[1].1 - w[0].1)
+                .filter(|d| !(0..=10).contains(d))
+                .collect();
+            assert_eq!(jumps, [jump + 10], "{jump}");
+        }
+    }
+
+    #[test]
+    fn a_late_burst_among_others_is_no_new_run() {
+        let mut readings: Vec<_> = (0..400).map(|n| imu(n * 10)).collect();
+        let burst: Vec<_> = (0..30).map(|n| truth(1000 + 10 * n)).collect();
+        for (n, late) in burst.into_iter().enumerate() {
+            readings.insert(300 + 2 * n, late);
+        }
+        let (events, skipped) = merge(readings, 0.5);
+        assert_eq!((events.len(), skipped.values().sum::<u64>()), (400, 30));
+        assert!(events.windows(2).all(|w| w[0].1 < w[1].1));
     }
 
     #[test]

@@ -1,38 +1,25 @@
 //! IMU samples and position fixes from text tables.
 //!
-//! The first line names the columns; fields are separated by commas, semicolons or blanks. Names
-//! are compared without regard to case; columns that are not named below are ignored, among them
-//! the `dt` of KITTI files, since intervals are differences of stamps.
+//! Columns are found by name (IMU samples as [`ImuCsv`] does); names are compared without regard
+//! to case; columns that are not named below are ignored, among them the `dt` of KITTI files,
+//! since intervals are differences of stamps.
 //!
 //! | value | names |
 //! | --- | --- |
-//! | stamp, s | `t`, `time`, `timestamp`, `stamp` |
-//! | angular velocity, rad/s | `gx gy gz`, `wx wy wz`, `omegaX omegaY omegaZ`, `gyroX ...`, `gyro_x ...` |
-//! | specific force, m/s^2 | `ax ay az`, `accelX accelY accelZ`, `acc_x ...`, `accel_x ...` |
+//! | stamp, s or ns | `t`, `time`, `timestamp`, `stamp` |
 //! | position, m, z up | `x y z`, `px py pz`, `tx ty tz`, `east north up` |
 
 use std::path::Path;
 
 use nalgebra::Vector3;
 
-use super::LogError;
-use super::text_table::{Row, TextTable, fields};
-use crate::sensor::{ImuSample, PositionFix};
+use super::imu_csv::ImuCsv;
+use super::text_table::{Row, TextTable, check_step};
+use super::{ImuRow, LogError};
+use crate::dialect::{Dialect, TimeUnit};
+use crate::sensor::{ImuSample, PositionFix, Stamp};
 
 const STAMP: &[&str] = &["t", "time", "timestamp", "stamp"];
-const RATE: &[[&str; 3]] = &[
-    ["gx", "gy", "gz"],
-    ["wx", "wy", "wz"],
-    ["omegax", "omegay", "omegaz"],
-    ["gyrox", "gyroy", "gyroz"],
-    ["gyro_x", "gyro_y", "gyro_z"],
-];
-const FORCE: &[[&str; 3]] = &[
-    ["ax", "ay", "az"],
-    ["accelx", "accely", "accelz"],
-    ["acc_x", "acc_y", "acc_z"],
-    ["accel_x", "accel_y", "accel_z"],
-];
 const POSITION: &[[&str; 3]] =
     &[["x", "y", "z"], ["px", "py", "pz"], ["tx", "ty", "tz"], ["east", "north", "up"]];
 
@@ -42,17 +29,24 @@ const POSITION: &[[&str; 3]] =
 /// [`LogError::Io`], or [`LogError::Corrupt`] with the column that is missing or the line that is
 /// wrong.
 pub fn read_imu_table(path: &Path) -> Result<Vec<ImuSample>, LogError> {
-    let mut table = NamedTable::open(path)?;
-    let stamp = table.column("stamp", STAMP)?;
-    let rate = table.columns("angular velocity", RATE)?;
-    let force = table.columns("specific force", FORCE)?;
-    table.rows(|row| {
-        Ok(ImuSample {
-            stamp: row.stamp(stamp)?,
-            angular_velocity: finite(row, rate)?,
-            specific_force: finite(row, force)?,
-        })
-    })
+    let mut rows = ImuCsv::open(path)?;
+    let mut samples = Vec::new();
+    while let Some(row) = rows.next().transpose()? {
+        let ImuRow { imu, .. } = row;
+        let mut values = imu.angular_velocity.iter().chain(imu.specific_force.iter());
+        if let Some(value) = values.find(|value| !value.is_finite()) {
+            return Err(rows.wrong_row(&format!("`{value}` is no finite number")));
+        }
+        samples.push(imu);
+    }
+    if samples.is_empty() {
+        return Err(empty(path));
+    }
+    Ok(samples)
+}
+
+fn empty(path: &Path) -> LogError {
+    LogError::Corrupt { path: path.to_path_buf(), reason: "holds no rows of numbers".to_owned() }
 }
 
 /// Position fixes in the order of the file.
@@ -63,13 +57,14 @@ pub fn read_position_table(path: &Path) -> Result<Vec<PositionFix>, LogError> {
     let mut table = NamedTable::open(path)?;
     let stamp = table.column("stamp", STAMP)?;
     let position = table.columns("position", POSITION)?;
-    table.rows(|row| {
+    let fixes = table.rows(stamp, |row| {
         Ok(PositionFix {
             stamp: row.stamp(stamp)?,
             position: finite(row, position)?,
             covariance: None,
         })
-    })
+    })?;
+    if fixes.is_empty() { Err(empty(path)) } else { Ok(fixes) }
 }
 
 fn finite(row: &Row, columns: [usize; 3]) -> Result<Vector3<f64>, String> {
@@ -81,7 +76,10 @@ fn finite(row: &Row, columns: [usize; 3]) -> Result<Vector3<f64>, String> {
 /// A table whose first line, which may begin with `#`, names the columns.
 struct NamedTable {
     lines: TextTable,
+    /// In lower case, without units.
     names: Vec<String>,
+    /// What they say of the unit of time.
+    units: Vec<Option<TimeUnit>>,
 }
 
 impl NamedTable {
@@ -91,9 +89,12 @@ impl NamedTable {
             let reason = "is empty; its first line must name the columns".to_owned();
             LogError::Corrupt { path: path.to_path_buf(), reason }
         })?;
-        let names = fields(header.trim_start_matches(['#', ' ']));
-        let names = names.iter().map(|name| name.to_lowercase()).collect();
-        Ok(Self { lines, names })
+        let header = header.trim_start_matches(['#', ' ']);
+        let plain =
+            |name: &str| name.split(['[', '(']).next().unwrap_or_default().trim().to_lowercase();
+        let names = Dialect::of(header).fields(header);
+        let units = names.clone().map(TimeUnit::of_name).collect();
+        Ok(Self { lines, names: names.map(plain).collect(), units })
     }
 
     fn position(&self, name: &str) -> Option<usize> {
@@ -125,13 +126,30 @@ impl NamedTable {
         })
     }
 
-    fn rows<T>(&mut self, parse: impl Fn(&Row) -> Result<T, String>) -> Result<Vec<T>, LogError> {
+    /// All rows; their stamps are in the column `stamp`.
+    fn rows(
+        &mut self,
+        stamp: usize,
+        parse: impl Fn(&Row) -> Result<PositionFix, String>,
+    ) -> Result<Vec<PositionFix>, LogError> {
         let mut rows = Vec::new();
+        let mut layout = None;
+        let mut last: Option<Stamp> = None;
         while let Some(line) = self.lines.next_line()? {
-            if !line.starts_with('#') {
-                let row = parse(&Row(&fields(&line)));
-                rows.push(row.map_err(|reason| self.lines.wrong_line(&reason))?);
+            if line.starts_with('#') {
+                continue;
             }
+            let (dialect, unit) = *layout.get_or_insert_with(|| {
+                let dialect = Dialect::of(&line);
+                let named = self.units.get(stamp).copied().flatten();
+                let first = || TimeUnit::of_stamp(dialect.fields(&line).nth(stamp).unwrap_or(""));
+                (dialect, named.unwrap_or_else(first))
+            });
+            let row = parse(&Row::new(&line, dialect, unit))
+                .and_then(|row| check_step(last, row.stamp).map(|()| row))
+                .map_err(|reason| self.lines.wrong_line(&reason))?;
+            last = Some(row.stamp);
+            rows.push(row);
         }
         Ok(rows)
     }
@@ -165,14 +183,28 @@ mod tests {
     }
 
     #[test]
+    fn fixes_in_every_spelling() {
+        let read = |text: &str| read_position_table(file(text).path()).unwrap();
+        let expected = read("t,x,y,z\n1403715524.5,1.5,2,-.5\n");
+        for text in [
+            "\u{feff}t;x;y;z\r\n1403715524,5;1,5;2;-,5\r\n",
+            "Time [ns] X Y Z\n1403715524500000000 1.5 2 -0.5\n",
+            "#timestamp,east [m],north [m],up [m]\n1403715524500000000,1.5,2,-0.5\n",
+        ] {
+            assert_eq!(read(text), expected, "{text}");
+        }
+    }
+
+    #[test]
     fn mistakes_name_the_column_or_the_line() {
         let message = |text: &str| read_imu_table(file(text).path()).unwrap_err().to_string();
-        assert!(message("").contains("is empty"));
-        assert!(message("t,ax,ay,az\n").contains("angular velocity"));
+        assert!(message("").contains("no rows"));
+        assert!(message("t,gx,gy,gz,ax,ay,az\n").contains("no rows"));
+        assert!(message("t,ax,ay,az\n").contains("line 1: no column `gx`"));
         let header = "t,gx,gy,gz,ax,ay,az\n";
         let short = message(&format!("{header}1,0,0,0,0,0,9.8\n2,0,0,0,0\n"));
         assert!(short.contains("line 3") && short.contains("5 fields"), "{short}");
         let bad = message(&format!("{header}1,0,nan,0,0,0,9.8\n"));
-        assert!(bad.contains("line 2") && bad.contains("`nan`"), "{bad}");
+        assert!(bad.contains("line 2") && bad.contains("`NaN`"), "{bad}");
     }
 }

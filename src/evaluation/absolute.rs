@@ -1,5 +1,6 @@
 use nalgebra::Isometry3;
 
+use super::align::align_attitudes;
 use super::{
     Alignment, AssociationOptions, EvaluationError, PosePairs, Similarity, Statistics, Trajectory,
     align, associate,
@@ -56,6 +57,9 @@ pub struct ApeResult {
     pub pairs: PosePairs,
     /// What was applied to the estimate.
     pub alignment: Similarity,
+    /// Of attitudes: their RMSE (degrees) under the rotation that fits the positions best, where
+    /// that says more of the alignment than of the estimate and another one was taken.
+    pub by_positions: Option<f64>,
     /// One error a pair: m or degrees.
     pub errors: Vec<f64>,
     pub statistics: Statistics,
@@ -78,13 +82,19 @@ pub fn ape_of_pairs(
     align_n: Option<usize>,
     relation: Relation,
 ) -> Result<ApeResult, EvaluationError> {
-    let alignment = align(&pairs, alignment, align_n)?;
+    let (alignment, by_positions) = match relation {
+        Relation::Translation => (align(&pairs, alignment, align_n)?, None),
+        Relation::Angle => {
+            let aligned = align_attitudes(&pairs, alignment, align_n)?;
+            (aligned.similarity, aligned.by_positions)
+        }
+    };
     for pose in &mut pairs.estimate {
         *pose = alignment.apply(pose);
     }
     let errors = absolute_errors(&pairs, relation);
     let statistics = Statistics::of(&errors).ok_or(EvaluationError::Empty)?;
-    Ok(ApeResult { pairs, alignment, errors, statistics })
+    Ok(ApeResult { pairs, alignment, by_positions, errors, statistics })
 }
 
 /// The error of each pair as it stands.

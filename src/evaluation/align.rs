@@ -27,6 +27,15 @@ pub enum Alignment {
 impl Alignment {
     pub const ALL: [Self; 5] = [Self::Se3, Self::Sim3, Self::Yaw, Self::Origin, Self::None];
 
+    /// The rotation that maximises `tr(R^T covariance)` among those that the alignment may take;
+    /// `None` where it is not unique.
+    fn rotation(self, covariance: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
+        match self {
+            Self::Yaw => yaw_rotation(covariance),
+            _ => rotation(covariance),
+        }
+    }
+
     pub fn name(self) -> &'static str {
         match self {
             Self::Se3 => "se3",
@@ -86,51 +95,142 @@ impl Serialize for Similarity {
 ///
 /// The least-squares solutions are those of Umeyama (1991), with the rotation from Horn's
 /// quaternion (1987), whose eigenvalue gap says whether the positions determine it; yaw-only is
-/// the closed form of Zhang and Scaramuzza (2018), as in OpenVINS, for one pair from its attitude.
+/// the closed form of Zhang and Scaramuzza (2018), as in OpenVINS. What the positions leave open
+/// (of points on a line the turn about it, of a single point all) is taken from the attitudes.
 pub fn align(
     pairs: &PosePairs,
     alignment: Alignment,
     n: Option<usize>,
 ) -> Result<Similarity, EvaluationError> {
-    let used = n.unwrap_or(pairs.len()).min(pairs.len());
-    let (estimate, reference) = (&pairs.estimate[..used], &pairs.reference[..used]);
-    let (Some(first_estimate), Some(first_reference)) = (estimate.first(), reference.first())
-    else {
-        let (name, expected) = ("align-n", "at least 1");
-        return Err(EvaluationError::Option { name, expected, value: used as f64 });
-    };
-    let degenerate = || EvaluationError::Degenerate { alignment, poses: used };
-    let moments = || PointMoments::of(reference, estimate);
-    match alignment {
-        Alignment::None => Ok(Similarity::identity()),
-        Alignment::Origin => {
-            let motion = first_reference * first_estimate.inverse();
-            Ok(Similarity {
-                rotation: motion.rotation,
-                translation: motion.translation.vector,
-                scale: 1.0,
-            })
-        }
-        Alignment::Se3 => {
-            let moments = moments();
-            Ok(moments.similarity(moments.rotation().ok_or_else(degenerate)?, 1.0))
-        }
-        Alignment::Sim3 => {
-            let moments = moments();
-            let rotation = moments.rotation().ok_or_else(degenerate)?;
-            let scale = moments.scale(&rotation);
-            let usable = scale > 0.0 && scale.is_finite();
-            if usable { Ok(moments.similarity(rotation, scale)) } else { Err(degenerate()) }
-        }
-        Alignment::Yaw => {
-            let mut moments = moments();
-            if used == 1 {
-                let relative = first_reference.rotation * first_estimate.rotation.inverse();
-                moments.covariance = relative.to_rotation_matrix().into_inner();
+    Ok(Fit::new(pairs, alignment, n)?.similarity)
+}
+
+/// An alignment for the comparison of attitudes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AttitudeAlignment {
+    pub similarity: Similarity,
+    /// Root mean square attitude error under the alignment that fits the positions best, degrees,
+    /// where that is not the one taken.
+    pub by_positions: Option<f64>,
+}
+
+/// The alignment of positions ([`align`]), unless the attitudes contradict it and the positions
+/// hardly mind: where the rotation of least squares over positions *and* attitudes, each weighted
+/// by its own residuals, more than halves the attitude error and makes the mean square position
+/// error at most twice as large, that one is taken. So a run that stands still or goes straight is
+/// not told an attitude error that only its alignment has.
+pub fn align_attitudes(
+    pairs: &PosePairs,
+    alignment: Alignment,
+    n: Option<usize>,
+) -> Result<AttitudeAlignment, EvaluationError> {
+    let fit = Fit::new(pairs, alignment, n)?;
+    let plain = AttitudeAlignment { similarity: fit.similarity, by_positions: None };
+    let Some(joint) = fit.joint() else { return Ok(plain) };
+    let (positions, attitudes) = (fit.residuals(&fit.similarity), fit.residuals(&joint));
+    let is_better = 4.0 * attitudes.attitude < positions.attitude
+        && attitudes.position <= 2.0 * positions.position;
+    Ok(match is_better {
+        true => AttitudeAlignment {
+            similarity: joint,
+            by_positions: Some(positions.attitude.sqrt().to_degrees()),
+        },
+        false => plain,
+    })
+}
+
+/// An alignment and the pairs that it is of.
+struct Fit<'a> {
+    alignment: Alignment,
+    reference: &'a [Isometry3<f64>],
+    estimate: &'a [Isometry3<f64>],
+    moments: PointMoments,
+    similarity: Similarity,
+}
+
+/// Mean squares, m^2 and rad^2.
+struct Residuals {
+    position: f64,
+    attitude: f64,
+}
+
+/// Weight of the attitudes where they decide only what the positions leave open.
+const FAINT: f64 = 1e-9;
+/// Mean square attitude errors below this are rounding, rad^2.
+const ROUNDING: f64 = 1e-14;
+
+impl<'a> Fit<'a> {
+    fn new(
+        pairs: &'a PosePairs,
+        alignment: Alignment,
+        n: Option<usize>,
+    ) -> Result<Self, EvaluationError> {
+        let used = n.unwrap_or(pairs.len()).min(pairs.len());
+        let (estimate, reference) = (&pairs.estimate[..used], &pairs.reference[..used]);
+        let (Some(first_estimate), Some(first_reference)) = (estimate.first(), reference.first())
+        else {
+            let (name, expected) = ("align-n", "at least 1");
+            return Err(EvaluationError::Option { name, expected, value: used as f64 });
+        };
+        let moments = PointMoments::of(reference, estimate);
+        let degenerate = || EvaluationError::Degenerate { alignment, poses: used };
+        let similarity = match alignment {
+            Alignment::None => Similarity::identity(),
+            Alignment::Origin => {
+                let motion = first_reference * first_estimate.inverse();
+                let (rotation, translation) = (motion.rotation, motion.translation.vector);
+                Similarity { rotation, translation, scale: 1.0 }
             }
-            Ok(moments.similarity(moments.yaw_rotation().ok_or_else(degenerate)?, 1.0))
-        }
+            Alignment::Se3 | Alignment::Sim3 | Alignment::Yaw => {
+                let positions = moments.covariance;
+                let attitudes = attitude_covariance(reference, estimate);
+                let filled = positions + attitudes * (FAINT * positions.norm());
+                let rotation = [positions, filled, attitudes]
+                    .iter()
+                    .find_map(|covariance| alignment.rotation(covariance))
+                    .ok_or_else(degenerate)?;
+                moments.similarity(rotation, alignment).ok_or_else(degenerate)?
+            }
+        };
+        Ok(Self { alignment, reference, estimate, moments, similarity })
     }
+
+    /// Least squares over positions and attitudes; `None` where the alignment is not one of least
+    /// squares.
+    fn joint(&self) -> Option<Similarity> {
+        if matches!(self.alignment, Alignment::None | Alignment::Origin) {
+            return None;
+        }
+        let attitudes = attitude_covariance(self.reference, self.estimate);
+        let by_attitudes =
+            self.moments.similarity(self.alignment.rotation(&attitudes)?, self.alignment)?;
+        // Variances of a component of the position and of the rotation vector.
+        let position = self.residuals(&self.similarity).position / 3.0;
+        let attitude = self.residuals(&by_attitudes).attitude.max(ROUNDING) / 3.0;
+        let scale = self.similarity.scale;
+        // tr(R^T C) falls by |e|^2 with a turn e of attitudes, by |e|^2 / 2 per m^2 of positions.
+        let joint = self.moments.covariance * scale + attitudes * (position / (2.0 * attitude));
+        self.moments.similarity(self.alignment.rotation(&joint)?, self.alignment)
+    }
+
+    fn residuals(&self, similarity: &Similarity) -> Residuals {
+        let mut sum = Residuals { position: 0.0, attitude: 0.0 };
+        for (reference, estimate) in self.reference.iter().zip(self.estimate) {
+            let estimate = similarity.apply(estimate);
+            let distance = estimate.translation.vector - reference.translation.vector;
+            sum.position += distance.norm_squared();
+            sum.attitude += estimate.rotation.angle_to(&reference.rotation).powi(2);
+        }
+        let n = self.reference.len() as f64;
+        Residuals { position: sum.position / n, attitude: sum.attitude / n }
+    }
+}
+
+/// Mean of `R_reference R_estimate^T`: the rotation nearest to it brings the attitudes together.
+fn attitude_covariance(reference: &[Isometry3<f64>], estimate: &[Isometry3<f64>]) -> Matrix3<f64> {
+    let turns = reference.iter().zip(estimate).map(|(r, e)| r.rotation * e.rotation.inverse());
+    let sum = turns.fold(Matrix3::zeros(), |sum, turn| sum + *turn.to_rotation_matrix().matrix());
+    sum / reference.len() as f64
 }
 
 /// First and second moments of two paired point sets.
@@ -165,33 +265,8 @@ impl PointMoments {
         }
     }
 
-    /// The proper rotation that maximises `tr(R^T covariance)`; `None` where it is not unique.
     pub(super) fn rotation(&self) -> Option<UnitQuaternion<f64>> {
-        let c = &self.covariance;
-        let skew =
-            Vector3::new(c[(2, 1)] - c[(1, 2)], c[(0, 2)] - c[(2, 0)], c[(1, 0)] - c[(0, 1)]);
-        let trace = c.trace();
-        let mut horn = Matrix4::zeros();
-        horn[(0, 0)] = trace;
-        horn.fixed_view_mut::<3, 1>(1, 0).copy_from(&skew);
-        horn.fixed_view_mut::<1, 3>(0, 1).copy_from(&skew.transpose());
-        let block = c + c.transpose() - Matrix3::identity() * trace;
-        horn.fixed_view_mut::<3, 3>(1, 1).copy_from(&block);
-        let eigen = SymmetricEigen::new(horn);
-        let largest = eigen.eigenvalues.imax();
-        let others = (0..4).filter(|i| *i != largest).map(|i| eigen.eigenvalues[i]);
-        let gap = eigen.eigenvalues[largest] - others.fold(f64::NEG_INFINITY, f64::max);
-        let determined = gap > UNDETERMINED * eigen.eigenvalues.amax() && gap > f64::EPSILON;
-        let q: Vector4<f64> = eigen.eigenvectors.column(largest).into_owned();
-        determined.then(|| UnitQuaternion::from_quaternion(Quaternion::new(q[0], q[1], q[2], q[3])))
-    }
-
-    /// The rotation about z that maximises `tr(R^T covariance)`; `None` where it is not unique.
-    fn yaw_rotation(&self) -> Option<UnitQuaternion<f64>> {
-        let c = &self.covariance;
-        let (sine, cosine) = (c[(1, 0)] - c[(0, 1)], c[(0, 0)] + c[(1, 1)]);
-        let determined = sine.hypot(cosine) > UNDETERMINED * c.norm() && c.norm() > f64::EPSILON;
-        determined.then(|| UnitQuaternion::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine)))
+        rotation(&self.covariance)
     }
 
     /// Least-squares scale for a given rotation (Umeyama 1991, eq. 42); NaN for a point.
@@ -200,10 +275,45 @@ impl PointMoments {
         (rotation.matrix().transpose() * self.covariance).trace() / self.estimate_variance
     }
 
-    fn similarity(&self, rotation: UnitQuaternion<f64>, scale: f64) -> Similarity {
+    /// Centre on centre; `None` where a scale is wanted and not determined.
+    fn similarity(
+        &self,
+        rotation: UnitQuaternion<f64>,
+        alignment: Alignment,
+    ) -> Option<Similarity> {
+        let scale = if alignment == Alignment::Sim3 { self.scale(&rotation) } else { 1.0 };
         let translation = self.reference_mean - scale * (rotation * self.estimate_mean);
-        Similarity { rotation, translation, scale }
+        let usable = scale > 0.0 && scale.is_finite();
+        usable.then_some(Similarity { rotation, translation, scale })
     }
+}
+
+/// The proper rotation that maximises `tr(R^T covariance)`; `None` where it is not unique.
+fn rotation(covariance: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
+    let c = covariance;
+    let skew = Vector3::new(c[(2, 1)] - c[(1, 2)], c[(0, 2)] - c[(2, 0)], c[(1, 0)] - c[(0, 1)]);
+    let trace = c.trace();
+    let mut horn = Matrix4::zeros();
+    horn[(0, 0)] = trace;
+    horn.fixed_view_mut::<3, 1>(1, 0).copy_from(&skew);
+    horn.fixed_view_mut::<1, 3>(0, 1).copy_from(&skew.transpose());
+    let block = c + c.transpose() - Matrix3::identity() * trace;
+    horn.fixed_view_mut::<3, 3>(1, 1).copy_from(&block);
+    let eigen = SymmetricEigen::new(horn);
+    let largest = eigen.eigenvalues.imax();
+    let others = (0..4).filter(|i| *i != largest).map(|i| eigen.eigenvalues[i]);
+    let gap = eigen.eigenvalues[largest] - others.fold(f64::NEG_INFINITY, f64::max);
+    let determined = gap > UNDETERMINED * eigen.eigenvalues.amax() && gap > f64::EPSILON;
+    let q: Vector4<f64> = eigen.eigenvectors.column(largest).into_owned();
+    determined.then(|| UnitQuaternion::from_quaternion(Quaternion::new(q[0], q[1], q[2], q[3])))
+}
+
+/// The rotation about z that maximises `tr(R^T covariance)`; `None` where it is not unique.
+fn yaw_rotation(covariance: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
+    let c = covariance;
+    let (sine, cosine) = (c[(1, 0)] - c[(0, 1)], c[(0, 0)] + c[(1, 1)]);
+    let determined = sine.hypot(cosine) > UNDETERMINED * c.norm() && c.norm() > f64::EPSILON;
+    determined.then(|| UnitQuaternion::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine)))
 }
 
 /// A rotation counts as undetermined when turning it changes the fit by less than this fraction.
@@ -215,6 +325,8 @@ mod tests {
     use approx::assert_relative_eq;
     use nalgebra::vector;
     use proptest::prelude::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
     /// Pairs whose estimate is a curve and whose reference is `motion` of it.
     fn moved(motion: &Similarity, n: usize) -> PosePairs {
@@ -276,22 +388,72 @@ mod tests {
         assert_relative_eq!(determinant, 1.0, epsilon = 1e-12);
     }
 
+    /// Pairs like those of [`moved`], their positions scaled by each factor and disturbed.
+    fn flattened(factors: Vector3<f64>, noise: f64) -> PosePairs {
+        let motion = Similarity {
+            rotation: UnitQuaternion::from_scaled_axis(vector![0.1, -0.2, 2.0]),
+            translation: vector![5.0, -3.0, 1.0],
+            scale: 1.0,
+        };
+        let mut pairs = moved(&motion, 200);
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut disturbed = |position: Vector3<f64>| {
+            position + Vector3::from_fn(|_, _| noise * (rng.random::<f64>() - 0.5))
+        };
+        for (reference, estimate) in pairs.reference.iter_mut().zip(&mut pairs.estimate) {
+            let exact = estimate.translation.vector.component_mul(&factors);
+            estimate.translation.vector = disturbed(exact);
+            let exact = motion.rotation * exact + motion.translation;
+            reference.translation.vector = disturbed(exact);
+        }
+        pairs
+    }
+
+    fn attitude_rmse(pairs: &PosePairs, similarity: &Similarity) -> f64 {
+        let angles = pairs.reference.iter().zip(&pairs.estimate).map(|(reference, estimate)| {
+            similarity.apply(estimate).rotation.angle_to(&reference.rotation).powi(2)
+        });
+        (angles.sum::<f64>() / pairs.len() as f64).sqrt().to_degrees()
+    }
+
     #[test]
-    fn positions_on_a_line_are_refused() {
-        let mut pairs = moved(&Similarity::identity(), 60);
-        for pose in pairs.reference.iter_mut().chain(&mut pairs.estimate) {
-            pose.translation.vector = Vector3::new(1.0, 2.0, 3.0) * pose.translation.y;
+    fn what_positions_leave_open_is_taken_from_the_attitudes() {
+        let lines = [vector![0.0, 1.0, 0.0], vector![0.0, 0.0, 1.0], vector![0.0, 0.0, 0.0]];
+        for (factors, noise) in lines.into_iter().flat_map(|f| [(f, 0.0), (f, 1e-4), (f, 1e-2)]) {
+            let pairs = flattened(factors, noise);
+            let aligned = align_attitudes(&pairs, Alignment::Se3, None).unwrap();
+            let error = attitude_rmse(&pairs, &aligned.similarity);
+            assert!(error < 0.1, "{factors:?}, {noise} m: {error} deg");
+            let position = |similarity: &Similarity| {
+                let fit = Fit::new(&pairs, Alignment::Se3, None).unwrap();
+                fit.residuals(similarity).position.sqrt()
+            };
+            assert!(position(&aligned.similarity) < noise + 1e-6);
+            // The best fit of positions stays the best fit of positions.
+            let plain = align(&pairs, Alignment::Se3, None).unwrap();
+            assert!(position(&plain) <= position(&aligned.similarity) + 1e-9);
         }
-        for alignment in [Alignment::Se3, Alignment::Sim3] {
-            let error = align(&pairs, alignment, None).unwrap_err();
-            assert!(matches!(error, EvaluationError::Degenerate { poses: 60, .. }), "{error}");
-        }
-        assert!(align(&pairs, Alignment::Yaw, None).is_ok());
-        assert!(align(&pairs, Alignment::Origin, None).is_ok());
+        let still = flattened(Vector3::zeros(), 0.0);
         assert!(matches!(
-            align(&pairs, Alignment::Se3, Some(0)),
+            align(&still, Alignment::Sim3, None),
+            Err(EvaluationError::Degenerate { poses: 200, .. })
+        ));
+        assert!(matches!(
+            align(&still, Alignment::Se3, Some(0)),
             Err(EvaluationError::Option { .. })
         ));
+    }
+
+    #[test]
+    fn attitudes_do_not_move_what_positions_determine() {
+        let mut pairs = flattened(vector![1.0, 1.0, 1.0], 1e-2);
+        let plain = align(&pairs, Alignment::Se3, None).unwrap();
+        // A mounting that nobody took into account: an error of the attitudes, not of the world.
+        for pose in &mut pairs.estimate {
+            pose.rotation *= UnitQuaternion::from_scaled_axis(vector![0.0, 0.3, 0.0]);
+        }
+        let aligned = align_attitudes(&pairs, Alignment::Se3, None).unwrap();
+        assert_eq!((aligned.similarity, aligned.by_positions), (plain, None));
     }
 
     #[test]

@@ -24,11 +24,13 @@ struct MetricsEvaluation {
 }
 
 /// One run of a method.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Run {
     /// Name of its directory: the sequence where a method has many.
     pub name: String,
     pub directory: PathBuf,
+    /// Whether it came to its end and wrote its metrics.
+    pub finished: bool,
     /// The rest is `None` where the run has no evaluation (no reference, or it failed).
     pub matched: Option<usize>,
     /// RMSE of the absolute position error, m.
@@ -74,7 +76,7 @@ pub struct Comparison {
 
 /// Puts the runs of several directories side by side.
 ///
-/// A directory is a run if it holds `metrics.json`, else a method whose sub-directories are runs.
+/// A directory is a run if it holds `metrics.json` or what a run writes before that, else a method whose sub-directories are runs.
 /// `success_limit` is the largest position RMSE of a success, m.
 pub fn compare(directories: &[PathBuf], success_limit: f64) -> Result<Comparison, EvaluationError> {
     let methods = directories
@@ -89,17 +91,23 @@ pub fn compare(directories: &[PathBuf], success_limit: f64) -> Result<Comparison
 }
 
 const METRICS: &str = "metrics.json";
+/// What a run that failed or was ended leaves.
+const UNFINISHED: [&str; 2] = ["trajectory.tum", "state.csv"];
+
+fn is_run(directory: &Path) -> bool {
+    [METRICS].iter().chain(&UNFINISHED).any(|name| directory.join(name).is_file())
+}
 
 impl Method {
     fn read(directory: &Path, success_limit: f64) -> Result<Self, EvaluationError> {
-        let runs = if directory.join(METRICS).is_file() {
+        let runs = if is_run(directory) {
             vec![Run::read(directory)?]
         } else {
             let io = |error| EvaluationError::Io { path: directory.to_owned(), error };
             let mut directories = Vec::new();
             for entry in std::fs::read_dir(directory).map_err(io)? {
                 let path = entry.map_err(io)?.path();
-                if path.join(METRICS).is_file() {
+                if is_run(&path) {
                     directories.push(path);
                 }
             }
@@ -131,6 +139,14 @@ impl Method {
 impl Run {
     fn read(directory: &Path) -> Result<Self, EvaluationError> {
         let path = directory.join(METRICS);
+        let finished = path.is_file();
+        if !finished {
+            return Ok(Self {
+                name: name_of(directory),
+                directory: directory.to_owned(),
+                ..Self::default()
+            });
+        }
         let text = std::fs::read_to_string(&path)
             .map_err(|error| EvaluationError::Io { path: path.clone(), error })?;
         let metrics: Metrics = serde_json::from_str(&text)
@@ -144,6 +160,7 @@ impl Run {
         Ok(Self {
             name: name_of(directory),
             directory: directory.to_owned(),
+            finished,
             matched: evaluation.map(|e| e.matched),
             position_rmse,
             attitude_rmse: evaluation.map(|e| e.ape_rotation_deg.rmse),

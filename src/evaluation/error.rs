@@ -40,7 +40,7 @@ pub enum EvaluationError {
         hint: String,
     },
     #[error(
-        "the positions of the {poses} poses to align lie on a line or in a point, which leaves the rotation of {alignment} alignment open; use origin or none"
+        "the {poses} poses to align do not determine {alignment} alignment: their positions lie in a point, or their attitudes have nothing in common; use origin or none"
     )]
     Degenerate { alignment: Alignment, poses: usize },
     #[error("a belief has no scale: use another alignment than sim3 for NEES")]

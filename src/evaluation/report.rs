@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::table::html_escaped;
 use super::{Figure, PlotError, Table};
+use crate::output;
 
 /// What a report shows, in this order.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -28,7 +29,7 @@ figure{margin:1em 0}svg{max-width:100%;height:auto}";
 
 /// Writes `report` as one HTML file without references to others.
 pub fn write_html(path: &Path, report: &Report) -> Result<(), PlotError> {
-    std::fs::write(path, to_html(report)?)
+    output::write(path, to_html(report)?)
         .map_err(|error| PlotError::Io { path: path.to_owned(), error })
 }
 

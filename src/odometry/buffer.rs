@@ -57,6 +57,15 @@ impl EventBuffer {
         self.ended = true;
     }
 
+    /// What comes now is by other clocks; what waited is dropped.
+    pub fn begin_anew(&mut self) {
+        self.imu.clear();
+        self.frames.clear();
+        self.truth = TruthTrack::default();
+        (self.now, self.last_imu, self.last_frame) = (None, None, None);
+        self.ended = false;
+    }
+
     pub fn now(&self) -> Option<Stamp> {
         self.now
     }

@@ -143,6 +143,12 @@ impl Health {
         self.summary.reinitializations += 1;
     }
 
+    /// What was wrong with the run before says nothing of the one that begins.
+    pub fn new_run(&mut self) {
+        (self.lost_since, self.lost_in_sight) = (None, false);
+        (self.diverged, self.bad_frames) = (None, 0);
+    }
+
     /// Takes note of whether a frame corrected the belief.
     pub fn see(&mut self, stamp: Stamp, sight: Sight) -> Option<Note> {
         match (sight.updated, self.lost_since) {

@@ -130,6 +130,19 @@ impl Odometry {
         self.buffer.end();
     }
 
+    /// What comes now is of another run, as `reason` says: all clocks were set, or all sensors
+    /// paused. What waits must have been processed ([`Self::end`], [`Self::step`]).
+    pub fn begin_new_run(&mut self, reason: String) {
+        let time = self.buffer.now().unwrap_or_default();
+        self.abandon(Divergence::View, time);
+        if let Some(legacy) = &mut self.legacy {
+            legacy.last_sample = None;
+        }
+        self.buffer.begin_anew();
+        self.supervisor.begin_anew(&self.config.imu);
+        self.supervisor.warn(reason);
+    }
+
     pub fn stats(&self) -> OdometryStats {
         let rest = self.run.as_ref().map_or(0.0, |run| run.rest.seconds());
         let summary = self.supervisor.health();

@@ -46,6 +46,15 @@ enum Prepared {
     Frame(FrontEndFrame),
 }
 
+impl Prepared {
+    fn stamp(&self) -> Stamp {
+        match self {
+            Self::Other(event) => event.stamp(),
+            Self::Frame(frame) => frame.frame.stamp,
+        }
+    }
+}
+
 /// What a run shows while it goes on.
 pub enum Observation<'a> {
     /// A sample, as it is read.
@@ -54,7 +63,36 @@ pub enum Observation<'a> {
     Frame { report: &'a StepReport, frame: &'a RgbdFrame, odometry: &'a Odometry },
 }
 
-/// Runs all of `events` through `odometry` and shows `observe` what happens, in order of time.
+/// If no sensor says anything for this long, what follows is another run, s.
+const LONGEST_SILENCE: f64 = 10.0;
+
+/// Why an event at `stamp` cannot belong to the run whose last one was at `last`.
+fn new_run(last: Stamp, stamp: Stamp) -> Option<String> {
+    let step = stamp.seconds_since(last);
+    if step < 0.0 {
+        Some(format!(
+            "the stamps of all sensors jump back by {:.3} s at {last} s: a new run begins, whose \
+             poses are written from there on",
+            -step
+        ))
+    } else if step > LONGEST_SILENCE {
+        Some(format!(
+            "the stamps of all sensors jump ahead by {step:.3} s at {last} s: a new run begins"
+        ))
+    } else {
+        None
+    }
+}
+
+/// Shows `observe` the frames that can be processed.
+fn show(odometry: &mut Odometry, observe: &mut impl FnMut(Observation)) {
+    while let Some((report, frame)) = odometry.step() {
+        observe(Observation::Frame { report: &report, frame: &frame, odometry });
+    }
+}
+
+/// Runs all of `events` through `odometry` and shows `observe` what happens, in order of time. Where
+/// their stamps jump back, or ahead by more than 10 s, a new run begins.
 pub fn run(
     events: impl Iterator<Item = Event> + Send,
     front_end: &mut dyn FrontEnd,
@@ -62,8 +100,15 @@ pub fn run(
     options: RunOptions,
     mut observe: impl FnMut(Observation),
 ) {
-    let events = Clipped { events, options, first: None };
+    let events = Clipped { events, options, first: None, started: false };
+    let mut last = None;
     let mut feed = |prepared: Prepared| {
+        let stamp = prepared.stamp();
+        if let Some(reason) = last.replace(stamp).and_then(|last| new_run(last, stamp)) {
+            odometry.end();
+            show(odometry, &mut observe);
+            odometry.begin_new_run(reason);
+        }
         match prepared {
             Prepared::Other(Event::Imu(sample)) => {
                 observe(Observation::Imu(&sample));
@@ -76,9 +121,7 @@ pub fn run(
             Prepared::Other(Event::Frame(_)) => {}
             Prepared::Frame(frame) => odometry.push_frame(frame),
         }
-        while let Some((report, frame)) = odometry.step() {
-            observe(Observation::Frame { report: &report, frame: &frame, odometry });
-        }
+        show(odometry, &mut observe);
     };
     if options.threads <= 1 {
         events.map(|event| prepare(event, front_end)).for_each(&mut feed);
@@ -92,9 +135,7 @@ pub fn run(
         });
     }
     odometry.end();
-    while let Some((report, frame)) = odometry.step() {
-        observe(Observation::Frame { report: &report, frame: &frame, odometry });
-    }
+    show(odometry, &mut observe);
 }
 
 fn send_all(events: impl Iterator<Item = Event>, to: &SyncSender<Event>) {
@@ -136,6 +177,7 @@ struct Clipped<'a, I> {
     events: I,
     options: RunOptions<'a>,
     first: Option<Stamp>,
+    started: bool,
 }
 
 impl<I: Iterator<Item = Event>> Iterator for Clipped<'_, I> {
@@ -152,9 +194,26 @@ impl<I: Iterator<Item = Event>> Iterator for Clipped<'_, I> {
             if time > self.options.start + self.options.duration {
                 return None;
             }
-            if time >= self.options.start {
+            // The clocks may be set back later on.
+            self.started |= time >= self.options.start;
+            if self.started {
                 return Some(event);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_ends_where_all_stamps_jump() {
+        let at = |seconds: f64| Stamp::default().offset_by(seconds);
+        for (last, stamp) in [(5.0, 5.0), (5.0, 5.005), (5.0, 14.9)] {
+            assert_eq!(new_run(at(last), at(stamp)), None, "{last} {stamp}");
+        }
+        assert!(new_run(at(5.0), at(4.0)).unwrap().contains("back by 1.000 s at 5.0"));
+        assert!(new_run(at(5.0), at(3605.0)).unwrap().contains("ahead by 3600.000 s at 5.0"));
     }
 }

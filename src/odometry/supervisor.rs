@@ -62,6 +62,15 @@ impl Supervisor {
         }
     }
 
+    /// What comes now is by other clocks: nothing that was usual counts any more.
+    pub fn begin_anew(&mut self, imu: &ImuConfig) {
+        self.sensors = SensorWatch::new(imu);
+        self.clock = ClockWatch::default();
+        self.gyroscope = GyroscopeWatch::default();
+        self.sound = None;
+        self.health.new_run();
+    }
+
     pub fn note(&mut self, note: Note) {
         self.notes.push(note);
     }

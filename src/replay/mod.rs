@@ -21,7 +21,7 @@ pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors, evaluat
 pub use faults::{FaultOutcome, Naming, Recovered, confusion, expected_name, fault_grid};
 pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
-pub use outputs::state_columns;
+pub use outputs::{RESULTS, state_columns};
 pub use report::{Series, figures, report};
 
 use crate::config::Config;
@@ -30,6 +30,7 @@ use crate::evaluation::{Similarity, Trajectory, is_vertical, read_trajectory};
 use crate::filter::FilterKind;
 use crate::inertial::pose_covariance;
 use crate::odometry::{FrontEnd, NoteLevel, Observation, Odometry, RunOptions, StepReport, run};
+use crate::output;
 use crate::sensor::{Event, ImuSample, RgbdFrame, Stamp, TruthPose};
 use metrics::{peak_memory_bytes, stage_summaries};
 use outputs::Outputs;
@@ -150,6 +151,7 @@ pub fn replay(
         log: log.as_mut(),
         given,
         pending: None,
+        body_from_camera: camera_in_reference(config, summary.has_imu),
         truth: &mut truth,
         faults,
         first: &mut first,
@@ -268,7 +270,7 @@ fn path_length(poses: &[TruthPose]) -> f64 {
 fn write_metrics(directory: &Path, metrics: &Metrics) -> Result<(), ReplayError> {
     let path = directory.join("metrics.json");
     let text = serde_json::to_string_pretty(metrics).map_err(std::io::Error::other);
-    text.and_then(|text| std::fs::write(&path, text + "\n"))
+    text.and_then(|text| output::write(&path, text + "\n"))
         .map_err(|source| ReplayError::Write { path, source })
 }
 
@@ -286,12 +288,21 @@ impl Span {
     }
 }
 
+/// Where in the body of the reference the camera is, if the estimate is of the camera: without an
+/// IMU.
+fn camera_in_reference(config: &Config, has_imu: bool) -> Isometry3<f64> {
+    let mounting = config.camera.imu_from_camera().filter(|_| !has_imu);
+    mounting.unwrap_or_else(Isometry3::identity)
+}
+
 /// The log's events; the reference poses among them are noted, or replaced by given ones.
 struct EventSource<'a> {
     log: &'a mut dyn Log,
     given: Option<Peekable<std::vec::IntoIter<TruthPose>>>,
     /// The log's next event, while given poses go before it.
     pending: Option<Event>,
+    /// From the frame whose poses are estimated to that of the reference.
+    body_from_camera: Isometry3<f64>,
     truth: &'a mut Vec<TruthPose>,
     faults: &'a [Fault],
     /// Stamp of the first event.
@@ -340,10 +351,20 @@ impl Iterator for EventSource<'_> {
             }
             None => event,
         };
+        let event = match event {
+            Event::Truth(pose) => Event::Truth(TruthPose {
+                world_from_body: pose.world_from_body * self.body_from_camera,
+                ..pose
+            }),
+            other => other,
+        };
+        // A new run may go through stamps that an earlier one had.
+        let is_new =
+            |pose: &TruthPose| self.truth.last().is_none_or(|last| last.stamp < pose.stamp);
         match &event {
-            Event::Truth(pose) => self.truth.push(*pose),
+            Event::Truth(pose) if is_new(pose) => self.truth.push(*pose),
             Event::Frame(frame) => self.note_frame(frame.stamp),
-            Event::Imu(_) => {}
+            Event::Truth(_) | Event::Imu(_) => {}
         }
         Some(event)
     }
@@ -406,7 +427,6 @@ impl Session {
         odometry: &Odometry,
         observers: &mut [&mut dyn Observer],
     ) {
-        self.series.push(report);
         for note in &report.notes {
             match note.level {
                 NoteLevel::Info => tracing::info!("{}", note.text),
@@ -416,6 +436,11 @@ impl Session {
             let (level, fault) = (note.level, note.fault);
             self.notes.push(LogEntry { seconds, level, fault, text });
         }
+        if self.estimate.last().is_some_and(|last| report.stamp <= last.stamp) {
+            // A new run, at stamps that an earlier one had.
+            return;
+        }
+        self.series.push(report);
         let estimate = report.state.world_from_body;
         self.estimate.push(TruthPose { stamp: report.stamp, world_from_body: estimate });
         self.covariances.push(pose_covariance(&report.covariance));

@@ -13,6 +13,17 @@ use crate::inertial::{NavCovariance, NavState, block};
 use crate::odometry::{MapPointView, StepReport};
 use crate::sensor::Stamp;
 
+/// All files that a replay may leave in its directory, with its recording.
+pub const RESULTS: [&str; 7] = [
+    "trajectory.tum",
+    "state.csv",
+    "metrics.json",
+    "map.ply",
+    "run.rrd",
+    "trajectory_optimized.tum",
+    "faults.json",
+];
+
 /// Writes trajectory and state line by line, so that an interrupted run leaves valid files.
 pub struct Outputs {
     trajectory: OutputFile,
@@ -207,16 +218,15 @@ fn write_faults(path: &Path, faults: &[Episode]) -> Result<(), ReplayError> {
 }
 
 fn write_map(path: &Path, map: &[MapPointView]) -> Result<(), ReplayError> {
-    let mut file = OutputFile::create(path.to_owned())?;
-    file.line("ply\nformat ascii 1.0")?;
-    file.line(&format!("element vertex {}", map.len()))?;
+    let mut text = format!("ply\nformat ascii 1.0\nelement vertex {}\n", map.len());
     for property in ["float x", "float y", "float z", "float sigma", "uint age"] {
-        file.line(&format!("property {property}"))?;
+        text.push_str(&format!("property {property}\n"));
     }
-    file.line("end_header")?;
+    text.push_str("end_header\n");
     for point in map {
         let [x, y, z] = point.position;
-        file.line(&format!("{x} {y} {z} {} {}", point.sigma(), point.age))?;
+        text.push_str(&format!("{x} {y} {z} {} {}\n", point.sigma(), point.age));
     }
-    file.finish()
+    crate::output::write(path, text)
+        .map_err(|source| ReplayError::Write { path: path.to_owned(), source })
 }

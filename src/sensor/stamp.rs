@@ -25,7 +25,8 @@ impl Stamp {
         (nanos.abs() < i64::MAX as f64).then_some(Self(nanos as i64))
     }
 
-    /// Reads decimal seconds (`1305031102.175304`) without going through a float.
+    /// Reads decimal seconds (`1305031102.175304`) without going through a float; `None` if that is
+    /// none or out of range.
     pub fn parse_seconds(text: &str) -> Option<Self> {
         let text = text.trim();
         let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
@@ -34,7 +35,8 @@ impl Stamp {
         match (exact, whole.parse::<i64>()) {
             (true, Ok(seconds)) => {
                 let digits: String = fraction.chars().chain("000000000".chars()).take(9).collect();
-                Some(Self::from_parts(seconds, digits.parse().ok()?))
+                let nanos: i64 = digits.parse().ok()?;
+                seconds.checked_mul(1_000_000_000)?.checked_add(nanos).map(Self)
             }
             _ => Self::from_seconds(text.parse().ok()?),
         }
@@ -86,7 +88,9 @@ mod tests {
 
     #[test]
     fn text_that_is_no_time_is_refused() {
-        for text in ["", "nan", "inf", "1.2.3", "abc", "1e300"] {
+        for text in
+            ["", "nan", "inf", "1.2.3", "abc", "1e300", "1403715524907143168", "9223372036.9"]
+        {
             assert_eq!(Stamp::parse_seconds(text), None, "{text}");
         }
     }

@@ -81,6 +81,7 @@ pub(super) fn judge(inspection: &Inspection, assumed: &Assumed) -> (Vec<Finding>
             timing(&mut findings, subject, topic, assumed);
         }
     }
+    reordering(&mut findings, inspection, assumed);
     color(&mut findings, inspection, assumed);
     depth(&mut findings, inspection, assumed);
     pairs(&mut findings, inspection);
@@ -99,7 +100,12 @@ fn verdict(findings: &[Finding], inspection: &Inspection) -> Verdict {
         .filter(|finding| finding.severity == Severity::Error)
         .map(|finding| finding.message.as_str())
         .collect();
-    let settings: Vec<String> = findings.iter().filter_map(|f| f.setting.clone()).collect();
+    let mut settings: Vec<String> = Vec::new();
+    for setting in findings.iter().filter_map(|finding| finding.setting.as_ref()) {
+        if !settings.contains(setting) {
+            settings.push(setting.clone());
+        }
+    }
     let purpose = if inspection.imu.is_some() { "VIO" } else { "RGB-D odometry (it has no IMU)" };
     let text = match (errors.is_empty(), settings.is_empty()) {
         (false, _) => format!("not fit for {purpose}: {}", errors.join("; ")),
@@ -170,13 +176,29 @@ fn timing(
             "{} messages out of order, by up to {:.3} s",
             timing.out_of_order, timing.largest_disorder
         );
-        let window = assumed.log.reorder_window;
-        if timing.largest_disorder <= window {
-            findings.add(Severity::Note, subject, format!("{text}: sorted when read"));
-        } else {
-            let wanted = format!("{:.1}", (timing.largest_disorder * 10.0).ceil() / 10.0);
-            findings.setting(subject, text, ("log.reorder_window", wanted), false);
-        }
+        let (severity, fate) = match timing.largest_disorder {
+            disorder if disorder <= assumed.log.reorder_window => {
+                (Severity::Note, "sorted when read")
+            }
+            disorder if disorder <= LONGEST_REORDERING => {
+                (Severity::Warning, "beyond the reorder window")
+            }
+            _ => (Severity::Warning, "left out"),
+        };
+        findings.add(severity, subject, format!("{text}: {fate}"));
+    }
+    if timing.set_back > 0 {
+        let text = format!(
+            "the clock is set back {}, by up to {:.3} s: where those of all sensors are, a new run \
+             begins",
+            if timing.set_back == 1 {
+                "once".to_owned()
+            } else {
+                format!("{} times", timing.set_back)
+            },
+            timing.largest_set_back
+        );
+        findings.add(Severity::Warning, subject, text);
     }
     if timing.duplicates > 0 {
         let text = format!("{} messages with the stamp of another: left out", timing.duplicates);
@@ -189,6 +211,24 @@ fn timing(
             clock.offset
         );
         findings.add(Severity::Note, subject, text);
+    }
+}
+
+/// Longest time that messages are waited for: more is no disorder of a recorder, s.
+const LONGEST_REORDERING: f64 = 10.0;
+
+/// The window within which the messages of all topics can be sorted, where it is not that.
+fn reordering(findings: &mut Findings, inspection: &Inspection, assumed: &Assumed) {
+    let subjects = ["color", "depth", "right", "imu", "truth"].into_iter();
+    let disorder = subjects
+        .filter_map(|subject| inspection.topic(subject)?.timing.as_ref())
+        .map(|timing| timing.largest_disorder)
+        .filter(|disorder| *disorder <= LONGEST_REORDERING)
+        .fold(0.0, f64::max);
+    if disorder > assumed.log.reorder_window {
+        let wanted = format!("{:.1}", (disorder * 10.0).ceil() / 10.0);
+        let text = format!("messages are out of order by up to {disorder:.3} s");
+        findings.setting("log", text, ("log.reorder_window", wanted), false);
     }
 }
 

@@ -42,6 +42,10 @@ pub struct Timing {
     pub out_of_order: usize,
     /// By how much, at most, s.
     pub largest_disorder: f64,
+    /// Times that the stamps jumped back and went on from there, as where a clock is set.
+    pub set_back: usize,
+    /// By how much, at most, s.
+    pub largest_set_back: f64,
     /// Messages stamped as another one.
     pub duplicates: usize,
     /// Log time minus header stamp, where there are both.
@@ -84,15 +88,7 @@ impl Times {
             true => ("log", &mut self.log),
             false => ("header", &mut self.header),
         };
-        let (mut out_of_order, mut largest_disorder, mut latest) = (0, 0.0_f64, None);
-        for stamp in stamps.iter() {
-            let behind = latest.map_or(0.0, |latest: Stamp| latest.seconds_since(*stamp));
-            if behind > 0.0 {
-                out_of_order += 1;
-                largest_disorder = largest_disorder.max(behind);
-            }
-            latest = latest.max(Some(*stamp));
-        }
+        let disorder = Disorder::of(stamps);
         let count = stamps.len();
         stamps.sort_unstable();
         stamps.dedup();
@@ -117,12 +113,67 @@ impl Times {
                 after: after.seconds(),
                 seconds: *length as f64 * 1e-9,
             }),
-            out_of_order,
-            largest_disorder,
+            out_of_order: disorder.messages,
+            largest_disorder: disorder.largest,
+            set_back: disorder.set_back,
+            largest_set_back: disorder.largest_set_back,
             duplicates: count - stamps.len(),
             log_clock: log_clock(self.offsets),
         })
     }
+}
+
+/// Stamps that are lower than one before.
+#[derive(Debug, Default)]
+struct Disorder {
+    messages: usize,
+    largest: f64,
+    set_back: usize,
+    largest_set_back: f64,
+}
+
+/// As many messages in a row that are behind, and go on to where the stamps were before without a
+/// gap or to the end, are of a clock that was set.
+const SET_BACK: usize = 5;
+
+impl Disorder {
+    /// Of stamps in order of arrival.
+    fn of(stamps: &[Stamp]) -> Self {
+        let step = |pair: &[Stamp]| pair[1].nanos().saturating_sub(pair[0].nanos());
+        let mut steps: Vec<i64> = stamps.windows(2).map(step).filter(|step| *step > 0).collect();
+        steps.sort_unstable();
+        let usual = steps.get(steps.len() / 2).map_or(0.0, |step| *step as f64 * 1e-9);
+        let mut found = Self::default();
+        let Some(mut latest) = stamps.first().copied() else { return found };
+        let mut next = 1;
+        while let Some(&stamp) = stamps.get(next) {
+            let behind = latest.seconds_since(stamp);
+            if behind <= 0.0 {
+                latest = stamp;
+                next += 1;
+                continue;
+            }
+            let run = run_behind(&stamps[next..], latest);
+            let last = stamps[next + run - 1];
+            let arrives = latest.seconds_since(last) <= GAP * usual || next + run == stamps.len();
+            if run >= SET_BACK && arrives {
+                found.set_back += 1;
+                found.largest_set_back = found.largest_set_back.max(behind);
+                latest = last;
+            } else {
+                found.messages += run;
+                found.largest = found.largest.max(behind);
+            }
+            next += run;
+        }
+        found
+    }
+}
+
+/// How many of the first stamps ascend and are not beyond `latest`; at least 1.
+fn run_behind(stamps: &[Stamp], latest: Stamp) -> usize {
+    let ascends = |pair: &&[Stamp]| pair[0] < pair[1] && pair[1] <= latest;
+    1 + stamps.windows(2).take_while(ascends).count()
 }
 
 fn log_clock(mut offsets: Vec<i64>) -> Option<LogClock> {
@@ -166,6 +217,20 @@ mod tests {
         assert!((timing.largest_disorder - 0.01).abs() < 1e-9);
         let clock = timing.log_clock.unwrap();
         assert!(!clock.same && (clock.offset - 2000.0).abs() < 1e-9 && clock.spread == 0.0);
+    }
+
+    #[test]
+    fn a_clock_that_is_set_back_is_no_disorder() {
+        let clock = |n: i64| if n < 50 { 10 * n } else { 10 * n - 300 };
+        let set = timing(&(0..100).map(clock).collect::<Vec<_>>(), 0);
+        assert_eq!((set.out_of_order, set.set_back), (0, 1));
+        assert!((set.largest_set_back - 0.29).abs() < 1e-9, "{set:?}");
+        // Ten late messages in a row, after which the others go on.
+        let mut late: Vec<i64> =
+            (0..100).filter(|n| !(40..50).contains(n)).map(|n| 10 * n).collect();
+        late.splice(70..70, (40..50).map(|n| 10 * n));
+        let late = timing(&late, 0);
+        assert_eq!((late.out_of_order, late.set_back), (10, 0));
     }
 
     #[test]

@@ -1,116 +1,15 @@
-//! Plots as values: panels of curves, coloured paths and boxes, drawn to SVG or PNG.
-//!
-//! The only part of the module that mentions `plotters`.
-
-use std::path::{Path, PathBuf};
-use std::sync::Once;
+//! Panels on a drawing area.
 
 use plotters::coord::Shift;
-use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
-use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
-use serde::Serialize;
 
-use super::statistics::quantile;
+use super::super::statistics::quantile;
+use super::axis::{
+    Axis, MAX_POINTS, equal_scales, extent, is_finite, padded, runs, thinned, ticks,
+};
+use super::{BoxPanel, CurvePanel, FONT, PathPanel, PlotError, drawing};
 
-/// A picture of several panels.
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct Figure {
-    pub title: String,
-    pub panels: Vec<Panel>,
-    /// Panels side by side.
-    pub columns: usize,
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub enum Panel {
-    Path(PathPanel),
-    Curves(CurvePanel),
-    Boxes(BoxPanel),
-}
-
-/// Two paths in a plane, in equal scales; the second one coloured by a value.
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct PathPanel {
-    pub title: String,
-    pub x_label: String,
-    pub y_label: String,
-    /// NaN interrupts the line.
-    pub reference: Vec<[f64; 2]>,
-    pub estimate: Vec<[f64; 2]>,
-    /// One for each point of `estimate`.
-    pub values: Vec<f64>,
-    pub value_label: String,
-}
-
-/// How values are laid out along an axis.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-pub enum Scale {
-    #[default]
-    Linear,
-    /// Decades of equal length; values that are not positive interrupt a line.
-    Logarithmic,
-}
-
-/// Curves over a common axis.
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct CurvePanel {
-    pub title: String,
-    pub x_label: String,
-    pub y_label: String,
-    /// Shaded below the curves.
-    pub bands: Vec<Band>,
-    pub curves: Vec<Curve>,
-    /// Least and largest value shown, where curves or bands go far beyond what is of interest.
-    pub limits: Option<[f64; 2]>,
-    pub x_scale: Scale,
-    pub y_scale: Scale,
-}
-
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct Curve {
-    pub name: String,
-    /// NaN interrupts the line.
-    pub points: Vec<[f64; 2]>,
-}
-
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct Band {
-    pub name: String,
-    /// `[x, low, high]`; NaN interrupts the band.
-    pub points: Vec<[f64; 3]>,
-}
-
-/// Distributions side by side: median, quartiles, 5 % and 95 % quantiles.
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct BoxPanel {
-    pub title: String,
-    pub x_label: String,
-    pub y_label: String,
-    pub groups: Vec<(String, Vec<f64>)>,
-}
-
-/// Why a figure could not be drawn or saved.
-#[derive(Debug, thiserror::Error)]
-pub enum PlotError {
-    #[error("{path}: a plot is saved as .svg or .png")]
-    Extension { path: PathBuf },
-    #[error("{path}: {error}")]
-    Io { path: PathBuf, error: std::io::Error },
-    #[error("drawing failed: {0}")]
-    Drawing(String),
-}
-
-/// Size of a panel, pixels of the SVG.
-const PANEL: (u32, u32) = (640, 400);
-/// Height of the line for the figure's title.
-const TITLE: u32 = 34;
-/// Pixels of a PNG per pixel of the SVG.
-const PNG_SCALE: u32 = 2;
-/// More points than this a line cannot be told apart.
-const MAX_POINTS: usize = 4000;
-const FONT: &str = "sans-serif";
 /// Colours that stay apart for the colour-blind (Okabe and Ito).
 const COLORS: [RGBColor; 7] = [
     RGBColor(0, 114, 178),
@@ -147,163 +46,13 @@ fn viridis(fraction: f64) -> RGBColor {
     RGBColor(channel(0), channel(1), channel(2))
 }
 
-impl Figure {
-    /// One panel of curves over logarithmic axes.
-    pub fn logarithmic(title: &str, x_label: &str, y_label: &str, curves: Vec<Curve>) -> Self {
-        let panel = CurvePanel {
-            x_label: x_label.to_owned(),
-            y_label: y_label.to_owned(),
-            curves,
-            x_scale: Scale::Logarithmic,
-            y_scale: Scale::Logarithmic,
-            ..Default::default()
-        };
-        Self { title: title.to_owned(), panels: vec![Panel::Curves(panel)], columns: 1 }
-    }
-
-    /// The same figure with `name` before its title.
-    pub fn titled(mut self, name: &str) -> Self {
-        self.title = format!("{name}: {}", self.title);
-        self
-    }
-
-    /// Width and height, pixels.
-    fn size(&self) -> (u32, u32) {
-        let columns = self.columns.clamp(1, self.panels.len().max(1)) as u32;
-        let rows = (self.panels.len() as u32).div_ceil(columns);
-        (columns * PANEL.0, rows * PANEL.1 + TITLE)
-    }
-
-    /// The figure as an SVG document.
-    pub fn to_svg(&self) -> Result<String, PlotError> {
-        let mut svg = String::new();
-        let root = SVGBackend::with_string(&mut svg, self.size()).into_drawing_area();
-        self.draw(&root, 1)?;
-        drop(root);
-        Ok(svg)
-    }
-
-    /// Saves as SVG or PNG, by the extension of `path`.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
-        match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
-            Some("svg") => std::fs::write(path, self.to_svg()?)
-                .map_err(|error| PlotError::Io { path: path.to_owned(), error }),
-            Some("png") => {
-                let (width, height) = self.size();
-                let size = (width * PNG_SCALE, height * PNG_SCALE);
-                let root = BitMapBackend::new(path, size).into_drawing_area();
-                self.draw(&root, PNG_SCALE)
-            }
-            _ => Err(PlotError::Extension { path: path.to_owned() }),
-        }
-    }
-
-    fn draw<DB: DrawingBackend>(
-        &self,
-        root: &DrawingArea<DB, Shift>,
-        scale: u32,
-    ) -> Result<(), PlotError> {
-        register_font();
-        let canvas = Canvas { scale };
-        root.fill(&WHITE).map_err(drawing)?;
-        let (title, body) = root.split_vertically(TITLE * scale);
-        let style = canvas.text(17).pos(Pos::new(HPos::Center, VPos::Center));
-        let (width, height) = title.dim_in_pixel();
-        title
-            .draw(&Text::new(self.title.as_str(), (width as i32 / 2, height as i32 / 2), style))
-            .map_err(drawing)?;
-        let columns = self.columns.clamp(1, self.panels.len().max(1));
-        let areas = body.split_evenly((self.panels.len().div_ceil(columns), columns));
-        for (panel, area) in self.panels.iter().zip(&areas) {
-            match panel {
-                Panel::Path(panel) => canvas.path(panel, area)?,
-                Panel::Curves(panel) => canvas.curves(panel, area)?,
-                Panel::Boxes(panel) => canvas.boxes(panel, area)?,
-            }
-        }
-        root.present().map_err(drawing)
-    }
-}
-
-fn drawing<E: std::error::Error + Send + Sync>(error: DrawingAreaErrorKind<E>) -> PlotError {
-    PlotError::Drawing(error.to_string())
-}
-
-/// Without a font no size of a text is known, not even for SVG.
-fn register_font() {
-    static ONCE: Once = Once::new();
-    ONCE.call_once(|| {
-        // Fails for broken font data only; then drawing says that the font is unavailable.
-        let _ = plotters::style::register_font(FONT, FontStyle::Normal, dejavu::sans::regular());
-    });
-}
-
 /// Sizes in pixels of the SVG, whatever is drawn on.
 #[derive(Clone, Copy)]
-struct Canvas {
-    scale: u32,
+pub(super) struct Canvas {
+    pub scale: u32,
 }
 
 type Chart<'a, DB> = ChartContext<'a, DB, Cartesian2d<Axis, Axis>>;
-
-/// One coordinate of a chart.
-#[derive(Clone, Copy)]
-struct Axis {
-    range: [f64; 2],
-    scale: Scale,
-}
-
-impl Axis {
-    fn linear(range: [f64; 2]) -> Self {
-        Self { range, scale: Scale::Linear }
-    }
-
-    /// The axis that holds `values`, its range extended by `pad` (of logarithms where they are
-    /// laid out).
-    fn of(values: impl Iterator<Item = f64>, scale: Scale, pad: fn([f64; 2]) -> [f64; 2]) -> Self {
-        let range = match scale {
-            Scale::Linear => pad(extent(values)),
-            Scale::Logarithmic => pad(extent(values.map(f64::log10))).map(|x| 10f64.powf(x)),
-        };
-        Self { range, scale }
-    }
-
-    /// The value, or NaN where the axis cannot show it.
-    fn shown(&self, value: f64) -> f64 {
-        if self.scale == Scale::Logarithmic && value <= 0.0 { f64::NAN } else { value }
-    }
-}
-
-impl Ranged for Axis {
-    type FormatOption = DefaultFormatting;
-    type ValueType = f64;
-
-    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
-        let [low, high] = self.range;
-        match self.scale {
-            Scale::Linear => RangedCoordf64::from(low..high).map(value, limit),
-            Scale::Logarithmic => {
-                RangedCoordf64::from(low.log10()..high.log10()).map(&value.log10(), limit)
-            }
-        }
-    }
-
-    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
-        let [low, high] = self.range;
-        let decades = low.log10().ceil() as i32..=high.log10().floor() as i32;
-        match self.scale {
-            Scale::Logarithmic if decades.clone().count() > 1 => {
-                let stride = decades.clone().count().div_ceil(hint.max_num_points().max(1));
-                decades.step_by(stride).map(|decade| 10f64.powi(decade)).collect()
-            }
-            _ => RangedCoordf64::from(low..high).key_points(hint),
-        }
-    }
-
-    fn range(&self) -> std::ops::Range<f64> {
-        self.range[0]..self.range[1]
-    }
-}
 
 /// Room around the axes: top, right, bottom (labels), left (labels).
 const MARGINS: [u32; 4] = [34, 20, 44, 64];
@@ -318,7 +67,7 @@ impl Canvas {
         length * self.scale
     }
 
-    fn text(self, size: u32) -> TextStyle<'static> {
+    pub fn text(self, size: u32) -> TextStyle<'static> {
         (FONT, self.px(size)).into_font().color(&BLACK)
     }
 
@@ -387,7 +136,7 @@ impl Canvas {
             .map_err(drawing)
     }
 
-    fn path<DB: DrawingBackend>(
+    pub fn path<DB: DrawingBackend>(
         self,
         panel: &PathPanel,
         area: &DrawingArea<DB, Shift>,
@@ -449,7 +198,7 @@ impl Canvas {
         area.draw(&Text::new(label.to_owned(), (left, self.px(18) as i32), style)).map_err(drawing)
     }
 
-    fn curves<DB: DrawingBackend>(
+    pub fn curves<DB: DrawingBackend>(
         self,
         panel: &CurvePanel,
         area: &DrawingArea<DB, Shift>,
@@ -504,7 +253,7 @@ impl Canvas {
         if names > 1 { self.legend(&mut chart) } else { Ok(()) }
     }
 
-    fn boxes<DB: DrawingBackend>(
+    pub fn boxes<DB: DrawingBackend>(
         self,
         panel: &BoxPanel,
         area: &DrawingArea<DB, Shift>,
@@ -557,74 +306,4 @@ impl Canvas {
         }
         Ok(())
     }
-}
-
-fn is_finite<const N: usize>(point: &[f64; N]) -> bool {
-    point.iter().all(|x| x.is_finite())
-}
-
-/// The parts between NaN.
-fn runs<const N: usize>(points: &[[f64; N]]) -> impl Iterator<Item = &[[f64; N]]> {
-    points.split(|point| !is_finite(point)).filter(|run| !run.is_empty())
-}
-
-/// At most [`MAX_POINTS`] points, the last one among them.
-fn thinned<const N: usize>(run: &[[f64; N]]) -> impl Iterator<Item = &[f64; N]> {
-    let stride = run.len().div_ceil(MAX_POINTS).max(1);
-    let last = run.last().filter(|_| !(run.len() - 1).is_multiple_of(stride));
-    run.iter().step_by(stride).chain(last)
-}
-
-/// Smallest and largest finite value, apart from each other.
-fn extent(values: impl Iterator<Item = f64>) -> [f64; 2] {
-    let [low, high] = values
-        .filter(|value| value.is_finite())
-        .fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], x| [low.min(x), high.max(x)]);
-    let least = 1e-9 * low.abs().max(high.abs()).max(1e-3);
-    match high - low {
-        spread if spread > least => [low, high],
-        spread if spread >= 0.0 => [low - least, high + least],
-        _ => [0.0, 1.0],
-    }
-}
-
-/// With room above and, unless the range starts at zero, below.
-fn padded([low, high]: [f64; 2]) -> [f64; 2] {
-    let room = 0.05 * (high - low);
-    let low = if (0.0..room).contains(&low) { 0.0 } else { low - room };
-    [low, high + room]
-}
-
-/// Widens one of two ranges so that a metre is as long on both axes of `pixels`.
-fn equal_scales(ranges: [[f64; 2]; 2], pixels: [u32; 2]) -> [[f64; 2]; 2] {
-    let per_pixel = |k: usize| (ranges[k][1] - ranges[k][0]) / f64::from(pixels[k]);
-    let scale = 1.08 * per_pixel(0).max(per_pixel(1));
-    [0, 1].map(|k| {
-        let middle = 0.5 * (ranges[k][0] + ranges[k][1]);
-        let half = 0.5 * scale * f64::from(pixels[k]);
-        [middle - half, middle + half]
-    })
-}
-
-/// Writes numbers with as many decimals as ticks on the axis need; decades as powers of ten.
-fn ticks(axis: Axis) -> impl Fn(&f64) -> String {
-    let [low, high] = axis.range;
-    let spread = (high - low).abs().max(f64::MIN_POSITIVE);
-    // A step is at least a seventh of the range.
-    let decimals = (0.8 - spread.log10()).ceil().clamp(0.0, 9.0) as usize;
-    let tiny = 1e-9 * spread;
-    move |value| {
-        let exponent = value.log10();
-        if axis.scale == Scale::Logarithmic && (exponent - exponent.round()).abs() < 1e-9 {
-            return format!("10{}", superscript(exponent.round() as i32));
-        }
-        let value = if value.abs() < tiny { 0.0 } else { *value };
-        format!("{value:.decimals$}")
-    }
-}
-
-fn superscript(number: i32) -> String {
-    const DIGITS: [char; 10] = ['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'];
-    let raised = |c: char| c.to_digit(10).map_or('⁻', |digit| DIGITS[digit as usize]);
-    number.to_string().chars().map(raised).collect()
 }
