@@ -63,7 +63,7 @@ fn available(folder: &Path) -> String {
 }
 
 /// Reads lines `stamp rest`; those that cannot be read are noted with their number.
-fn read_list(
+pub(super) fn read_list(
     folder: &Path,
     name: &str,
     listing: &mut Listing,
@@ -89,7 +89,7 @@ fn read_list(
     Ok(())
 }
 
-fn image_path(folder: &Path, text: &str) -> Result<std::path::PathBuf, Rejection> {
+pub(super) fn image_path(folder: &Path, text: &str) -> Result<std::path::PathBuf, Rejection> {
     if text.is_empty() {
         return Err(Rejection::new("no file name", text));
     }
