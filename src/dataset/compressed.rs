@@ -142,7 +142,7 @@ pub(super) fn depth_image(
         }
         DepthData::Rvl { data, size: (width, height), inverse } => {
             let pixels = u64::from(width) * u64::from(height);
-            if pixels == 0 || 2 * pixels > LARGEST_IMAGE {
+            if pixels == 0 || pixels > LARGEST_IMAGE / 2 {
                 return Err(Rejection::new("absurd size", format!("{width}x{height}")));
             }
             ((width, height), rvl::decode(data, pixels as usize)?, inverse)

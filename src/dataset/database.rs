@@ -22,16 +22,16 @@ const LARGEST_MESSAGE: usize = 256 << 20;
 
 /// Where a database is; one that was decompressed is deleted with the last of its readers.
 #[derive(Debug, Clone)]
-pub(super) struct DatabaseFile {
-    path: PathBuf,
-    decompressed: Option<Arc<TempPath>>,
+pub(super) enum DatabaseFile {
+    Given(PathBuf),
+    Decompressed(Arc<TempPath>),
 }
 
 impl DatabaseFile {
     /// # Errors
     /// [`LogError::Corrupt`] if it is no database of messages, or damaged where it lists topics.
     pub fn open(path: &Path) -> Result<Self, LogError> {
-        Self::check(Self { path: path.to_path_buf(), decompressed: None }, path)
+        Self::check(Self::Given(path.to_path_buf()), path)
     }
 
     /// A database that was decompressed from `origin`.
@@ -39,8 +39,7 @@ impl DatabaseFile {
     /// # Errors
     /// As [`Self::open`], naming `origin`.
     pub fn temporary(file: TempPath, origin: &Path) -> Result<Self, LogError> {
-        let path = file.to_path_buf();
-        Self::check(Self { path, decompressed: Some(Arc::new(file)) }, origin)
+        Self::check(Self::Decompressed(Arc::new(file)), origin)
     }
 
     fn check(file: Self, origin: &Path) -> Result<Self, LogError> {
@@ -51,17 +50,24 @@ impl DatabaseFile {
         Ok(file)
     }
 
+    fn path(&self) -> &Path {
+        match self {
+            Self::Given(path) => path,
+            Self::Decompressed(path) => path,
+        }
+    }
+
     fn connect(&self) -> rusqlite::Result<Connection> {
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-        let mut wal = self.path.clone().into_os_string();
+        let mut wal = self.path().as_os_str().to_owned();
         wal.push("-wal");
         let has_journal = std::fs::metadata(&wal).is_ok_and(|journal| journal.len() > 0);
         // What a recorder that was killed left in its journal belongs to the bag. Without one nothing
         // but the file itself is touched, so that it may lie where nothing can be written.
-        if has_journal && let Ok(connection) = Connection::open_with_flags(&self.path, flags) {
+        if has_journal && let Ok(connection) = Connection::open_with_flags(self.path(), flags) {
             return Ok(connection);
         }
-        Connection::open_with_flags(immutable(&self.path), flags | OpenFlags::SQLITE_OPEN_URI)
+        Connection::open_with_flags(immutable(self.path()), flags | OpenFlags::SQLITE_OPEN_URI)
     }
 
     /// The messages from the start.
@@ -74,7 +80,7 @@ impl DatabaseFile {
             Ok((connection, channels)) => (Some(connection), channels, None),
             Err(error) => (None, BTreeMap::new(), Some(error.to_string())),
         };
-        Database { file: self.clone(), connection, channels, failure, only: None, last_row: None }
+        Database { _file: self.clone(), connection, channels, failure, only: None, last_row: None }
     }
 }
 
@@ -95,8 +101,7 @@ fn immutable(path: &Path) -> String {
 /// The messages of a database in the order in which they were stored.
 pub(super) struct Database {
     /// Kept while it is read.
-    #[expect(dead_code)]
-    file: DatabaseFile,
+    _file: DatabaseFile,
     connection: Option<Connection>,
     channels: BTreeMap<i64, Channel>,
     failure: Option<String>,

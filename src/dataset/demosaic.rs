@@ -52,8 +52,9 @@ fn reflected(index: usize, step: isize, count: usize) -> usize {
 
 /// RGB from luminance and chroma of ITU-R BT.601 with 16 to 235 for black to white.
 fn yuv_to_rgb(y: u8, u: u8, v: u8) -> [u8; 3] {
-    let (y, u, v) = (f32::from(y) - 16.0, f32::from(u) - 128.0, f32::from(v) - 128.0);
-    let grey = 1.164 * y;
+    // Blacker than black is black.
+    let grey = 1.164 * (f32::from(y) - 16.0).max(0.0);
+    let (u, v) = (f32::from(u) - 128.0, f32::from(v) - 128.0);
     let to_byte = |value: f32| value.round().clamp(0.0, 255.0) as u8;
     [grey + 1.596 * v, grey - 0.813 * v - 0.391 * u, grey + 2.018 * u].map(to_byte)
 }

@@ -323,7 +323,7 @@ mod tests {
         assert_eq!(sample.angular_velocity, Vector3::new(4.0, 5.0, 6.0));
         assert_eq!(pose.world_from_body.translation.vector, Vector3::new(7.0, 8.0, 9.0));
         assert_eq!(pose.world_from_body.rotation.k, 1.0);
-        assert_eq!(frame.depth.at(0, 0), Some(1.5));
+        assert_eq!(frame.depth.data(), [1500; 8]);
     }
 
     #[test]

@@ -201,7 +201,7 @@ mod tests {
     use super::*;
 
     fn at_millis(millis: f64) -> Stamp {
-        Stamp::from_nanos((millis * 1e6) as i64)
+        Stamp::from_nanos((millis * 1e6).round() as i64)
     }
 
     /// A rate and a force that are linear in time, so that interpolation is exact.

@@ -489,7 +489,7 @@ mod tests {
     }
 
     #[test]
-    fn color_in_three_channels_and_depth_of_its_size_are_preferred() {
+    fn color_in_three_channels_and_depth_that_is_nothing_else_are_preferred() {
         let folder = tempfile::tempdir().unwrap();
         let mut samples = vec![
             samples::image(false, "/a/mono", "mono8", 1, 1000, 1),
@@ -498,7 +498,7 @@ mod tests {
         samples.extend(samples::recording(false));
         let summary = detect(&bag(&folder, &samples)).unwrap();
         assert_eq!(summary.sources["color"], samples::COLOR);
-        assert_eq!(summary.sources["depth"], "/b/ir");
+        assert_eq!(summary.sources["depth"], samples::DEPTH);
         let mono: Vec<_> =
             samples.into_iter().filter(|sample| sample.topic != samples::COLOR).collect();
         assert_eq!(detect(&bag(&folder, &mono)).unwrap().sources["color"], "/a/mono");

@@ -1,10 +1,12 @@
 //! What `ros2 bag record` leaves: a folder with one or more files of messages, whole or compressed,
 //! and mostly a `metadata.yaml`, which is needed for nothing but the order of the files.
 
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use super::message::Serialization;
 use super::ros::{Channel, Message, MessageSource, Visitor};
+use super::section::invalid;
 use super::{LogError, ReadReport};
 
 /// Names of files of messages end so, perhaps with one of [`COMPRESSED`] after it.
@@ -184,15 +186,13 @@ impl MessageSource for Unpacked {
     }
 }
 
-fn unpack(data: &[u8], buffer: &mut Vec<u8>) -> std::io::Result<()> {
-    let decoder = zstd::Decoder::with_buffer(data)?;
+fn unpack(data: &[u8], buffer: &mut Vec<u8>) -> io::Result<()> {
     buffer.clear();
-    let count = std::io::Read::take(decoder, LARGEST_MESSAGE + 1);
-    let count = std::io::copy(&mut { count }, buffer)?;
-    if count > LARGEST_MESSAGE {
-        return Err(super::section::invalid(format!("more than {LARGEST_MESSAGE} bytes")));
+    let count = zstd::Decoder::with_buffer(data)?.take(LARGEST_MESSAGE + 1).read_to_end(buffer)?;
+    match count as u64 > LARGEST_MESSAGE {
+        true => Err(invalid(format!("more than {LARGEST_MESSAGE} bytes"))),
+        false => Ok(()),
     }
-    Ok(())
 }
 
 #[cfg(test)]
