@@ -413,7 +413,8 @@ fn encodings_that_are_not_read_are_named_with_those_that_are() {
     let error = refused(&plain_color, &lossy);
     let expected = "encoding 16UC1; jpeg compressed of /d/compressed is not supported";
     assert!(error.contains(expected), "{error}");
-    let video = |frame: &RgbdFrame| compressed("/c", frame.stamp, "h264", &[0, 0, 0, 1, 0x67]);
+    let stream = [&[0, 0, 0, 1, 0x67][..], &[0; 60]].concat();
+    let video = |frame: &RgbdFrame| compressed("/c", frame.stamp, "h264", &stream);
     let error = refused(&video, &plain_depth);
     assert!(error.contains("encoding h264 of /c is not supported"), "{error}");
 }

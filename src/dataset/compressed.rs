@@ -30,17 +30,27 @@ pub(super) struct CompressedHead {
 }
 
 impl CompressedHead {
-    pub fn of(image: &CompressedImage) -> Self {
+    /// # Errors
+    /// If there are too few bytes to tell.
+    pub fn of(image: &CompressedImage) -> Result<Self, Rejection> {
+        if image.data.len() < ENOUGH {
+            let detail = format!("{} bytes", image.data.len());
+            return Err(Rejection::new("buffer too short", detail));
+        }
         let encoding = if image.format.is_empty() { "(none)" } else { image.format }.to_owned();
         if let Ok(depth) = DepthData::of(image) {
             let size = depth.size();
-            return Self { encoding, size, is_depth: true, is_supported: true };
+            return Ok(Self { encoding, size, is_depth: true, is_supported: true });
         }
-        let size = file_size(image.data);
         let is_depth = is_depth_format(image.format);
-        Self { encoding, size, is_depth, is_supported: !is_depth && size.is_some() }
+        let is_known = image.data.starts_with(PNG) || image.data.starts_with(JPEG);
+        let size = file_size(image.data);
+        Ok(Self { encoding, size, is_depth, is_supported: !is_depth && is_known })
     }
 }
+
+/// Bytes that hold the heads of all formats.
+const ENOUGH: usize = CONFIG_HEADER + 26;
 
 /// Whether a format's text speaks of depth: `16UC1; compressedDepth png`, `32FC1; png compressed`.
 fn is_depth_format(format: &str) -> bool {
@@ -263,7 +273,7 @@ mod tests {
         }
         for format in ["png", "16UC1; png compressed ", ""] {
             assert_eq!(read(format, &file).unwrap(), [1000, 0, 0], "{format}");
-            assert!(CompressedHead::of(&message(format, &file)).is_depth);
+            assert!(CompressedHead::of(&message(format, &file)).unwrap().is_depth);
         }
     }
 
@@ -274,8 +284,10 @@ mod tests {
         let data = with_header([0.0; 2], &data);
         let format = "16UC1; compressedDepth rvl";
         assert_eq!(read(format, &data).unwrap(), [0, 0, 10, 12, 9, 0]);
-        let head = CompressedHead::of(&message(format, &data));
+        let longer = [&data[..], &[0; 30]].concat();
+        let head = CompressedHead::of(&message(format, &longer)).unwrap();
         assert_eq!((head.size, head.is_depth, head.is_supported), (Some((3, 2)), true, true));
+        assert_eq!(reason(CompressedHead::of(&message(format, &data))), "buffer too short");
         assert_eq!(reason(read(format, &data[..15])), "buffer too short");
         let huge = with_header([0.0; 2], &[0xff; 12]);
         assert_eq!(reason(read(format, &huge)), "absurd size");
@@ -304,7 +316,7 @@ mod tests {
         let error = depth_image(&message, &LogConfig::default()).unwrap_err();
         assert_eq!(error.reason, "unsupported encoding");
         assert!(error.detail.starts_with("encoding 16UC1; jpeg compressed is not supported"));
-        let head = CompressedHead::of(&message);
+        let head = CompressedHead::of(&message).unwrap();
         assert!(head.is_depth && !head.is_supported);
         assert_eq!(reason(read("16UC1; compressedDepth", &png(grey))), "unsupported encoding");
     }
@@ -318,7 +330,8 @@ mod tests {
         DynamicImage::from(color).write_to(&mut jpeg, ImageFormat::Jpeg).unwrap();
         let image = color_file(jpeg.get_ref()).unwrap();
         assert!(image.format() == PixelFormat::Rgb8 && image.data()[0].abs_diff(200) < 4);
-        let head = CompressedHead::of(&message("bgr8; jpeg compressed bgr8", jpeg.get_ref()));
+        let head =
+            CompressedHead::of(&message("bgr8; jpeg compressed bgr8", jpeg.get_ref())).unwrap();
         assert_eq!((head.size, head.is_depth, head.is_supported), (Some((8, 8)), false, true));
         let transparent = image::RgbaImage::from_pixel(1, 1, image::Rgba([1, 2, 3, 0]));
         assert_eq!(color_file(&png(transparent)).unwrap().data(), [1, 2, 3]);

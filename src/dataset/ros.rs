@@ -347,7 +347,8 @@ impl ImageHead {
                 Some(Self::raw(image.encoding, (image.width, image.height)))
             }
             MessageType::CompressedImage => {
-                Some(Self::compressed(CompressedHead::of(&message::compressed_image(fields()?)?)))
+                let image = message::compressed_image(fields()?)?;
+                Some(Self::compressed(CompressedHead::of(&image)?))
             }
             _ => None,
         })
