@@ -7,7 +7,7 @@ use mfg_vio::replay::{AttitudeMetrics, AttitudeRequest, Reached, replay_attitude
 /// Estimate attitude and gyro bias from an IMU and a magnetometer.
 ///
 /// The log is CSV with the columns t,gx,gy,gz,ax,ay,az[,mx,my,mz] (s, rad/s, m/s^2; the magnetic
-/// field in any unit), MCAP or a ROS 1 bag with an IMU. World z is up and y is magnetic north;
+/// field in any unit), MCAP or a ROS bag with an IMU. World z is up and y is magnetic north;
 /// without a magnetometer the heading counts from where it began. With --out the directory receives
 /// attitude.csv: time, quaternion (world_from_body), gyro bias (rad/s), the singular values s1 s2 s3
 /// of the matrix Fisher parameter and the covariance of the body-frame rotation vector (rad^2), one

@@ -20,9 +20,11 @@ use mfg_vio::vision::OrbExtractor;
 
 /// Run the estimator over a log of RGB-D frames and IMU samples.
 ///
-/// The format is guessed from the content: MCAP (ROS 1 or ROS 2 messages), ROS 1 bag, TUM RGB-D
-/// folder, 7-Scenes folder. With --out the directory receives trajectory.tum (pose of the body:
-/// the IMU, or the camera where there is no IMU), state.csv, metrics.json, map.ply, faults.json and run.rrd.
+/// The format is guessed from the content: MCAP (ROS 1 or ROS 2 messages), ROS 1 bag, ROS 2 bag
+/// (.db3, or the folder of a recording, split or compressed), and folders of TUM RGB-D, EuRoC,
+/// OpenLORIS, Stray Scanner and 7-Scenes. With --out the directory receives trajectory.tum (pose of
+/// the body: the IMU, or the camera where there is no IMU), state.csv, metrics.json, map.ply,
+/// faults.json and run.rrd.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  mfg-vio replay lab_bumper1.bag --config configs/vcu_rvi.toml \
                         --filter mfgd --out runs/bumper1\n  rerun runs/bumper1/run.rrd")]

@@ -82,8 +82,11 @@ pub struct LogConfig {
     /// Topic of the right one of two cameras, of which `color_topic` is the left one; empty: a
     /// second image like the color image where there is no depth; `"none"`: not used.
     pub right_topic: String,
-    /// Topic of the IMU; empty: chosen by message type; `"none"`: not used.
+    /// Topic of the IMU, or of its gyroscope; empty: chosen by message type; `"none"`: not used.
     pub imu_topic: String,
+    /// Topic of the accelerometer where it is apart from the gyroscope; empty: chosen by what the
+    /// messages hold; `"none"`: not used.
+    pub accel_topic: String,
     /// Topic of the reference poses; empty: chosen by message type; `"none"`: not used.
     pub truth_topic: String,
     /// Channel order of color images whose encoding is only `8UC3`: `"bgr"` or `"rgb"`.
@@ -107,6 +110,7 @@ impl Default for LogConfig {
             depth_topic: String::new(),
             right_topic: String::new(),
             imu_topic: String::new(),
+            accel_topic: String::new(),
             truth_topic: String::new(),
             color_8uc3: "bgr".to_owned(),
             depth_scale: 0.001,
@@ -152,13 +156,15 @@ pub enum LogError {
     #[error("{path}: {source}")]
     Io { path: PathBuf, source: std::io::Error },
     #[error(
-        "{path}: not a log this program reads ({reason}); it reads .mcap, ROS 1 .bag, TUM RGB-D, EuRoC and 7-Scenes folders"
+        "{path}: not a log this program reads ({reason}); it reads .mcap, ROS 1 .bag, ROS 2 bags (.db3 or folder), TUM RGB-D, EuRoC and 7-Scenes folders"
     )]
     UnknownFormat { path: PathBuf, reason: String },
     #[error("{path}: {reason}")]
     Corrupt { path: PathBuf, reason: String },
     #[error("{path}: no {role} in this log; it has: {available}")]
     MissingStream { path: PathBuf, role: &'static str, available: String },
+    #[error("{path}: encoding {encoding} of {topic} is not supported; supported are {supported}")]
+    Encoding { path: PathBuf, topic: String, encoding: String, supported: &'static str },
     #[error("{path}: no depth, and none from its two cameras: {reason}")]
     Stereo { path: PathBuf, reason: String },
     #[error("log.{key} = {value}: expected {expected}")]

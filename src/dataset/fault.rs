@@ -355,8 +355,11 @@ fn at_depth(image: &DepthImage, share: f64, depth: f64) -> DepthImage {
 fn moved(mut reading: Reading, seconds: f64) -> Reading {
     let stamp = match &mut reading {
         Reading::Color(stamp, _) | Reading::Right(stamp, _) | Reading::Depth(stamp, _) => stamp,
+        Reading::Gyroscope(stamp, _) | Reading::Accelerometer(stamp, _) => stamp,
         Reading::Imu(sample) => &mut sample.stamp,
         Reading::Truth(pose) => &mut pose.stamp,
+        Reading::Gnss(fix) => &mut fix.stamp,
+        Reading::Magnetic(sample) => &mut sample.stamp,
     };
     *stamp = stamp.offset_by(seconds);
     reading

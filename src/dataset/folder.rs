@@ -2,14 +2,17 @@
 
 use std::path::{Path, PathBuf};
 
+use nalgebra::Vector3;
+
+use super::compressed::{color_file, depth_file};
 use super::merge::{Reading, ReadingSource};
 use super::pair::{Paired, Pairer};
-use super::pixels::{Rejection, compressed_color, compressed_depth};
+use super::pixels::Rejection;
 use super::ros::Role;
 use super::{LogConfig, LogError, ReadReport, TruthPose};
 use crate::inertial::ImuConfig;
 use crate::sensor::{ImuSample, Stamp};
-use crate::vision::StereoRig;
+use crate::vision::{DepthRegistration, StereoRig};
 
 /// Files larger than this are not images of a log, bytes.
 const LARGEST_FILE: u64 = 256 << 20;
@@ -22,6 +25,9 @@ pub(super) enum Entry {
     Depth(PathBuf),
     /// As logged.
     Imu(ImuSample),
+    /// As logged, without the other half.
+    Gyroscope(Vector3<f64>),
+    Accelerometer(Vector3<f64>),
     Truth(TruthPose),
 }
 
@@ -33,6 +39,8 @@ pub(super) struct Listing {
     pub rejections: Vec<(String, String)>,
     /// Where depth comes from two cameras.
     pub stereo: Option<StereoRig>,
+    /// Where depth images are not those of the color camera.
+    pub registration: Option<DepthRegistration>,
 }
 
 impl Listing {
@@ -47,7 +55,7 @@ impl Listing {
             match entry {
                 Entry::Color(_) => pairer.add_color(*stamp, ()),
                 Entry::Depth(_) | Entry::Right(_) => pairer.add_depth(*stamp, ()),
-                Entry::Imu(_) | Entry::Truth(_) => false,
+                _ => false,
             };
         }
         let mut frames = 0;
@@ -101,7 +109,8 @@ impl Entry {
             Self::Color(_) => Role::Color,
             Self::Depth(_) => Role::Depth,
             Self::Right(_) => Role::Right,
-            Self::Imu(_) => Role::Imu,
+            Self::Imu(_) | Self::Gyroscope(_) => Role::Imu,
+            Self::Accelerometer(_) => Role::Accelerometer,
             Self::Truth(_) => Role::Truth,
         }
     }
@@ -116,17 +125,23 @@ pub(super) fn read_entry(
 ) -> Result<Reading, Rejection> {
     let (path, reading) = match entry {
         Entry::Truth(pose) => return Ok(Reading::Truth(*pose)),
-        Entry::Imu(sample) => return Ok(Reading::Imu(imu.in_si_units(&sample))),
+        Entry::Imu(sample) => return Ok(Reading::Imu(imu.in_si_units(sample))),
+        Entry::Gyroscope(rate) => {
+            return Ok(Reading::Gyroscope(stamp, rate * imu.gyroscope_scale));
+        }
+        Entry::Accelerometer(force) => {
+            return Ok(Reading::Accelerometer(stamp, force * imu.accelerometer_scale));
+        }
         Entry::Color(path) => {
-            let image = read_file(path).and_then(|bytes| compressed_color(&bytes));
+            let image = read_file(path).and_then(|bytes| color_file(&bytes));
             (path, image.map(|image| Reading::Color(stamp, image)))
         }
         Entry::Right(path) => {
-            let image = read_file(path).and_then(|bytes| compressed_color(&bytes));
+            let image = read_file(path).and_then(|bytes| color_file(&bytes));
             (path, image.map(|image| Reading::Right(stamp, image)))
         }
         Entry::Depth(path) => {
-            let image = read_file(path).and_then(|bytes| compressed_depth(&bytes, config));
+            let image = read_file(path).and_then(|bytes| depth_file(&bytes, config));
             (path, image.map(|image| Reading::Depth(stamp, image)))
         }
     };

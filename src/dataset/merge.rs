@@ -2,9 +2,13 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
+use nalgebra::Vector3;
+
 use super::pair::{Paired, Pairer};
 use super::{Event, Log, LogConfig, LogSummary, ReadReport, RgbdFrame, TruthPose};
-use crate::sensor::{ColorImage, DepthImage, ImuSample, Stamp, Stream};
+use crate::sensor::{
+    ColorImage, DepthImage, GnssFix, ImuSample, MagneticSample, Stamp, Stream,
+};
 
 /// One message of a stream that is used, decoded.
 #[derive(Debug, Clone, PartialEq)]
@@ -14,7 +18,14 @@ pub(super) enum Reading {
     Right(Stamp, ColorImage),
     Depth(Stamp, DepthImage),
     Imu(ImuSample),
+    /// Angular velocity alone, rad/s; [`UnitedSource`](super::inertial_halves::UnitedSource) makes
+    /// samples of the two halves.
+    Gyroscope(Stamp, Vector3<f64>),
+    /// Specific force alone, m/s^2.
+    Accelerometer(Stamp, Vector3<f64>),
     Truth(TruthPose),
+    Gnss(GnssFix),
+    Magnetic(MagneticSample),
 }
 
 /// Readings in the order in which they were logged.
@@ -27,8 +38,11 @@ impl Reading {
     pub fn stamp(&self) -> Stamp {
         match self {
             Self::Color(stamp, _) | Self::Right(stamp, _) | Self::Depth(stamp, _) => *stamp,
+            Self::Gyroscope(stamp, _) | Self::Accelerometer(stamp, _) => *stamp,
             Self::Imu(sample) => sample.stamp,
             Self::Truth(pose) => pose.stamp,
+            Self::Gnss(fix) => fix.stamp,
+            Self::Magnetic(sample) => sample.stamp,
         }
     }
 
@@ -39,7 +53,7 @@ impl Reading {
                 Some((image.width() as u32, image.height() as u32))
             }
             Self::Depth(_, image) => Some((image.width() as u32, image.height() as u32)),
-            Self::Imu(_) | Self::Truth(_) => None,
+            _ => None,
         }
     }
 
@@ -47,9 +61,11 @@ impl Reading {
         match self {
             Self::Color(..) => 0,
             Self::Depth(..) => 1,
-            Self::Imu(_) => 2,
+            Self::Imu(_) | Self::Gyroscope(..) | Self::Accelerometer(..) => 2,
             Self::Truth(_) => 3,
             Self::Right(..) => 4,
+            Self::Gnss(_) => 5,
+            Self::Magnetic(_) => 6,
         }
     }
 
@@ -58,7 +74,7 @@ impl Reading {
         match self {
             Self::Color(_, image) | Self::Right(_, image) => color_size(image),
             Self::Depth(_, image) => depth_size(image),
-            Self::Imu(_) | Self::Truth(_) => ENTRY_SIZE,
+            _ => ENTRY_SIZE,
         }
     }
 }
@@ -74,7 +90,8 @@ fn depth_size(image: &DepthImage) -> usize {
     ENTRY_SIZE + 2 * image.data().len()
 }
 
-const STREAMS: [&str; 5] = ["color image", "depth image", "imu", "truth", "right image"];
+const STREAMS: [&str; 7] =
+    ["color image", "depth image", "imu", "truth", "right image", "gnss", "magnetic field"];
 
 /// A step of a stream's stamps longer than this is believed only when the next message confirms
 /// it: one damaged stamp in the future would otherwise make all that follow it late.
@@ -320,6 +337,13 @@ impl ReorderBuffer {
             Reading::Truth(pose) => self.add_event(1, Event::Truth(pose)),
             Reading::Right(..) => {
                 report.skip_at("right image: no calibration", stamp);
+                return;
+            }
+            Reading::Gyroscope(..)
+            | Reading::Accelerometer(..)
+            | Reading::Gnss(_)
+            | Reading::Magnetic(_) => {
+                report.skip_at(&format!("{stream}: not used by odometry"), stamp);
                 return;
             }
         };

@@ -9,7 +9,7 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use super::TruthPose;
 use super::pixels::{RawImage, Rejection};
 use crate::inertial::ImuConfig;
-use crate::sensor::{ImuSample, Stamp};
+use crate::sensor::Stamp;
 
 /// How the messages of a channel are serialised.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,6 +29,11 @@ pub(super) enum MessageType {
     Odometry,
     CameraInfo,
     Transforms,
+    NavSatFix,
+    MagneticField,
+    /// `geometry_msgs/Vector3Stamped`, by which older drivers publish the magnetic field.
+    Vector3Stamped,
+    NmeaSentence,
 }
 
 impl MessageType {
@@ -43,6 +48,10 @@ impl MessageType {
             "nav_msgs/Odometry" => Some(Self::Odometry),
             "sensor_msgs/CameraInfo" => Some(Self::CameraInfo),
             "tf2_msgs/TFMessage" | "tf/tfMessage" => Some(Self::Transforms),
+            "sensor_msgs/NavSatFix" => Some(Self::NavSatFix),
+            "sensor_msgs/MagneticField" => Some(Self::MagneticField),
+            "geometry_msgs/Vector3Stamped" => Some(Self::Vector3Stamped),
+            "nmea_msgs/Sentence" => Some(Self::NmeaSentence),
             _ => None,
         }
     }
@@ -106,8 +115,12 @@ impl<'a> Fields<'a> {
         Ok(value)
     }
 
-    fn u8(&mut self) -> Result<u8, Rejection> {
+    pub fn u8(&mut self) -> Result<u8, Rejection> {
         self.primitive().map(u8::from_le_bytes)
+    }
+
+    pub fn u16(&mut self) -> Result<u16, Rejection> {
+        self.primitive().map(u16::from_le_bytes)
     }
 
     fn u32(&mut self) -> Result<u32, Rejection> {
@@ -118,7 +131,7 @@ impl<'a> Fields<'a> {
         self.primitive().map(f64::from_le_bytes)
     }
 
-    fn f64s<const N: usize>(&mut self) -> Result<[f64; N], Rejection> {
+    pub fn f64s<const N: usize>(&mut self) -> Result<[f64; N], Rejection> {
         let mut values = [0.0; N];
         for value in &mut values {
             *value = self.f64()?;
@@ -131,7 +144,7 @@ impl<'a> Fields<'a> {
         self.bytes(length as usize)
     }
 
-    fn text(&mut self) -> Result<&'a str, Rejection> {
+    pub fn text(&mut self) -> Result<&'a str, Rejection> {
         let bytes = self.byte_sequence()?;
         let bytes = bytes.strip_suffix(&[0]).unwrap_or(bytes);
         std::str::from_utf8(bytes).map_err(|e| Rejection::new("text is not UTF-8", e.to_string()))
@@ -154,7 +167,7 @@ impl<'a> Fields<'a> {
         Ok(Stamp::from_parts(seconds, i64::from(nanos)))
     }
 
-    fn vector(&mut self) -> Result<Vector3<f64>, Rejection> {
+    pub fn vector(&mut self) -> Result<Vector3<f64>, Rejection> {
         self.f64s::<3>().map(Vector3::from)
     }
 }
@@ -184,46 +197,49 @@ pub(super) fn compressed_image<'a>(
     Ok(CompressedImage { stamp, format: fields.text()?, data: fields.byte_sequence()? })
 }
 
-impl<'a> CompressedImage<'a> {
-    /// The PNG of a depth image; `compressedDepth` puts a header of 12 bytes before it.
-    pub fn depth_file(&self) -> Result<&'a [u8], Rejection> {
-        if self.format.contains("compressedDepth") {
-            // With 32FC1 the PNG holds inverse depth, quantised.
-            if self.format.starts_with("32FC1") {
-                return Err(Rejection::new("unsupported encoding", self.format));
-            }
-            return self.data.get(12..).ok_or_else(|| {
-                Rejection::new("buffer too short", format!("{} bytes", self.data.len()))
-            });
+/// What of a `sensor_msgs/Imu` is measured, in SI units; both or one of the two.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct InertialReading {
+    pub stamp: Stamp,
+    pub angular_velocity: Option<Vector3<f64>>,
+    pub specific_force: Option<Vector3<f64>>,
+}
+
+impl InertialReading {
+    /// Taking zeros, which no accelerometer reads, for what is not measured.
+    pub fn without_zeros(self) -> Self {
+        let nonzero = |value: &Vector3<f64>| *value != Vector3::zeros();
+        Self {
+            stamp: self.stamp,
+            angular_velocity: self.angular_velocity.filter(nonzero),
+            specific_force: self.specific_force.filter(nonzero),
         }
-        Ok(self.data)
     }
 }
 
-pub(super) fn is_depth_format(format: &str) -> bool {
-    ["compressedDepth", "16UC1", "mono16"].iter().any(|word| format.contains(word))
-}
-
-pub(super) fn imu(mut fields: Fields, config: &ImuConfig) -> Result<ImuSample, Rejection> {
+/// `sensor_msgs/Imu`. Where the covariance of a quantity begins with -1, it is not measured by
+/// definition of the message; zeros that stand for that are left to whoever knows the topic.
+pub(super) fn imu(mut fields: Fields, config: &ImuConfig) -> Result<InertialReading, Rejection> {
     let stamp = fields.header()?;
     let _orientation: ([f64; 4], [f64; 9]) = (fields.f64s()?, fields.f64s()?);
-    let angular_velocity = fields.vector()?;
-    let angular_velocity_covariance: [f64; 9] = fields.f64s()?;
-    let acceleration = fields.vector()?;
-    let acceleration_covariance: [f64; 9] = fields.f64s()?;
-    // By definition of the message, -1 marks a quantity that is not measured.
-    for covariance in [angular_velocity_covariance, acceleration_covariance] {
-        if covariance[0] == -1.0 {
-            let detail = "covariance -1: not measured";
-            return Err(Rejection::new("no gyroscope or no accelerometer in the message", detail));
-        }
+    let mut measured = || -> Result<Option<Vector3<f64>>, Rejection> {
+        let (value, covariance) = (fields.vector()?, fields.f64s::<9>()?);
+        Ok((covariance[0] != -1.0).then_some(value))
+    };
+    let reading = InertialReading {
+        stamp,
+        angular_velocity: measured()?.map(|rate| rate * config.gyroscope_scale),
+        specific_force: measured()?.map(|force| force * config.accelerometer_scale),
+    };
+    let [rate, force] = [reading.angular_velocity, reading.specific_force];
+    if rate.is_none() && force.is_none() {
+        let detail = format!("both covariances are -1 at {stamp} s");
+        return Err(Rejection::new("neither gyroscope nor accelerometer in the message", detail));
     }
-    let logged = ImuSample { stamp, angular_velocity, specific_force: acceleration };
-    let sample = config.in_si_units(&logged);
-    if !sample.is_finite() {
+    if [rate, force].iter().flatten().any(|value| !value.iter().all(|x| x.is_finite())) {
         return Err(Rejection::new("not finite", format!("at {stamp} s")));
     }
-    Ok(sample)
+    Ok(reading)
 }
 
 /// Pose of a `PoseStamped`, `TransformStamped` or `Odometry` message.
@@ -360,26 +376,33 @@ mod tests {
         for (data, serialization) in [(ros1, Serialization::Ros1), (cdr, Serialization::Cdr)] {
             let sample = imu(Fields::new(&data, serialization).unwrap(), &config).unwrap();
             assert_eq!(sample.stamp, stamp());
-            assert_eq!(sample.angular_velocity, Vector3::new(0.1, 0.2, 0.3));
-            assert_relative_eq!(sample.specific_force, Vector3::new(9.81, 0.0, -4.905));
+            assert_eq!(sample.angular_velocity, Some(Vector3::new(0.1, 0.2, 0.3)));
+            assert_relative_eq!(sample.specific_force.unwrap(), Vector3::new(9.81, 0.0, -4.905));
         }
     }
 
     #[test]
-    fn imu_without_accelerometer_or_with_nan_is_rejected() {
-        let frame = format!("07000000{HEADER}00000000");
-        for (covariance, reason) in [
-            ("000000000000f0bf", "no gyroscope or no accelerometer in the message"),
-            ("0000000000000000", "not finite"),
-        ] {
-            let mut data = imu_message(&frame, covariance);
-            if reason == "not finite" {
-                let rates = 16 + 32 + 72;
-                data[rates..rates + 8].copy_from_slice(&f64::NAN.to_le_bytes());
-            }
-            let fields = Fields::new(&data, Serialization::Ros1).unwrap();
-            assert_eq!(imu(fields, &ImuConfig::default()).unwrap_err().reason, reason);
-        }
+    fn covariance_minus_one_marks_what_is_not_measured() {
+        let read = |data: &[u8]| {
+            imu(Fields::new(data, Serialization::Ros1).unwrap(), &ImuConfig::default())
+        };
+        let mut data = imu_message(&format!("07000000{HEADER}00000000"), "000000000000f0bf");
+        let reading = read(&data).unwrap();
+        assert_eq!(reading.angular_velocity, Some(Vector3::new(0.1, 0.2, 0.3)));
+        assert_eq!(reading.specific_force, None);
+        let rate_covariance = 16 + 32 + 72 + 24;
+        data[rate_covariance..rate_covariance + 8].copy_from_slice(&(-1_f64).to_le_bytes());
+        let reason = read(&data).unwrap_err().reason;
+        assert_eq!(reason, "neither gyroscope nor accelerometer in the message");
+    }
+
+    #[test]
+    fn imu_with_nan_is_rejected() {
+        let mut data = imu_message(&format!("07000000{HEADER}00000000"), &"00".repeat(8));
+        let rates = 16 + 32 + 72;
+        data[rates..rates + 8].copy_from_slice(&f64::NAN.to_le_bytes());
+        let fields = Fields::new(&data, Serialization::Ros1).unwrap();
+        assert_eq!(imu(fields, &ImuConfig::default()).unwrap_err().reason, "not finite");
     }
 
     #[test]

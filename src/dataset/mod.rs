@@ -5,30 +5,44 @@
 //! yield readings directly, and [`merge`] orders and pairs the readings. A log that is cut or damaged yields all that can still be read.
 
 mod bag;
+mod compressed;
 mod convert;
+mod database;
+mod decode;
 mod definition;
+mod demosaic;
+mod encoding;
 mod euroc;
 mod event;
 mod fault;
 mod folder;
 mod imu_csv;
+mod inertial_halves;
 mod inspect;
 mod mcap_file;
 mod merge;
 mod message;
+mod navigation;
 mod navigation_csv;
+mod navigation_message;
+mod nmea;
 mod open;
+mod openloris;
 mod output;
 mod pair;
 mod pixels;
 mod records;
+mod registration;
 mod ros;
 mod ros2;
+mod rosbag2;
+mod rvl;
 #[cfg(test)]
 mod samples;
 mod section;
 mod seven_scenes;
 mod stereo;
+mod stray;
 mod text_table;
 mod tum;
 mod write;
@@ -44,6 +58,7 @@ pub use inspect::{
     GyroscopeUnit, ImuInspection, Inspection, LogClock, PairInspection, Severity, Sign, Timing,
     TopicInspection, Verdict, inspect,
 };
+pub use navigation::{NavigationLog, NavigationTopics, read_navigation};
 pub use navigation_csv::{read_imu_table, read_position_table};
 pub use open::{detect, open, open_with_faults};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

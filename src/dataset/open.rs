@@ -1,18 +1,25 @@
 //! Guesses what a log is from its content.
 
-use std::io::Read;
 use std::path::Path;
 
 use super::bag::{Bag, BagFormat};
+use super::database::{DatabaseFile, MAGIC};
+use super::decode::RosSource;
 use super::fault::FaultySource;
 use super::folder::{FolderSource, Listing};
+use super::inertial_halves::UnitedSource;
 use super::mcap_file::{McapFile, McapFormat};
 use super::merge::{MergedLog, ReadingSource};
+use super::nmea::is_nmea;
 use super::records::Format as _;
-use super::ros::{MessageSource, RosSource, Survey};
-use super::section::LogFile;
+use super::registration::RegisteredSource;
+use super::ros::{MessageSource, Survey};
+use super::rosbag2::{self, Chain, Unpacked, ZSTD_MAGIC};
+use super::section::{LogFile, decompress, first_bytes};
 use super::stereo::StereoSource;
-use super::{Fault, Log, LogConfig, LogError, LogSummary, euroc, seven_scenes, tum};
+use super::{
+    Fault, Log, LogConfig, LogError, LogSummary, euroc, openloris, seven_scenes, stray, tum,
+};
 use crate::inertial::ImuConfig;
 use crate::vision::StereoRig;
 
@@ -22,31 +29,113 @@ pub(super) enum Contents {
     Messages(MessageLog),
 }
 
-/// A file of messages.
+/// A file of messages, or several that follow one another.
 pub(super) struct MessageLog {
-    file: LogFile,
-    format: MessageFormat,
+    files: Vec<MessageFile>,
+    kind: &'static str,
 }
 
-#[derive(Debug, Clone, Copy)]
-enum MessageFormat {
-    Bag,
-    Mcap,
+enum MessageFile {
+    Bag(LogFile),
+    Mcap(LogFile),
+    Database(DatabaseFile),
 }
 
 impl MessageLog {
     pub fn kind(&self) -> &'static str {
-        match self.format {
-            MessageFormat::Bag => "ROS 1 bag",
-            MessageFormat::Mcap => "MCAP",
-        }
+        self.kind
     }
 
     /// The messages from the start.
     pub fn messages(&self) -> Box<dyn MessageSource> {
-        match self.format {
-            MessageFormat::Bag => Box::new(Bag::new(self.file.clone())),
-            MessageFormat::Mcap => Box::new(McapFile::new(self.file.clone())),
+        let mut sources: Vec<_> = self.files.iter().map(MessageFile::messages).collect();
+        match sources.len() {
+            1 => sources.remove(0),
+            _ => Box::new(Chain::new(sources)),
+        }
+    }
+
+    /// The files of a ROS 2 bag that can be read; an error where none can.
+    fn of_folder(folder: &Path) -> Result<Self, LogError> {
+        let (mut files, mut failure) = (Vec::new(), None);
+        for path in rosbag2::list(folder)? {
+            match MessageFile::open(&path) {
+                Ok(file) => files.push(file),
+                // A recorder that was killed leaves an empty last file.
+                Err(error) => {
+                    tracing::warn!("left out: {error}");
+                    failure = failure.or(Some(error));
+                }
+            }
+        }
+        match failure {
+            Some(error) if files.is_empty() => Err(error),
+            _ => Ok(Self { files, kind: "ROS 2 bag" }),
+        }
+    }
+}
+
+impl MessageFile {
+    /// Guesses the format from the content.
+    fn open(path: &Path) -> Result<Self, LogError> {
+        let start = first_bytes(path)?;
+        if !start.starts_with(ZSTD_MAGIC) {
+            return Self::of_start(
+                path,
+                &start,
+                || LogFile::open(path),
+                || DatabaseFile::open(path),
+            );
+        }
+        let failed = |source| LogError::Io { path: path.to_path_buf(), source };
+        let mut file = tempfile::NamedTempFile::new().map_err(failed)?;
+        decompress(path, file.as_file_mut())?;
+        let start = first_bytes(file.path())?;
+        let handle = file.reopen().map_err(failed)?;
+        let name = file.into_temp_path();
+        let database = || DatabaseFile::temporary(name, path);
+        Self::of_start(path, &start, || LogFile::of(handle, path), database)
+    }
+
+    fn of_start(
+        path: &Path,
+        start: &[u8],
+        file: impl FnOnce() -> Result<LogFile, LogError>,
+        database: impl FnOnce() -> Result<DatabaseFile, LogError>,
+    ) -> Result<Self, LogError> {
+        let unknown =
+            |reason: String| Err(LogError::UnknownFormat { path: path.to_path_buf(), reason });
+        match () {
+            () if start.starts_with(McapFormat::MAGIC) => file().map(Self::Mcap),
+            () if start.starts_with(BagFormat::MAGIC) => file().map(Self::Bag),
+            () if start.starts_with(MAGIC) => database().map(Self::Database),
+            () if start.is_empty() => unknown("the file is empty".to_owned()),
+            () if start.starts_with(b"#ROSBAG") => {
+                unknown("a bag of a format before 2.0; `rosbag migrate` updates it".to_owned())
+            }
+            () if is_nmea(start) => {
+                unknown("NMEA sentences, which `mfg-vio gnss` reads".to_owned())
+            }
+            () => {
+                let start = start[..start.len().min(16)].escape_ascii();
+                unknown(format!("it begins with `{start}`"))
+            }
+        }
+    }
+
+    fn kind(&self) -> &'static str {
+        match self {
+            Self::Bag(_) => "ROS 1 bag",
+            Self::Mcap(_) => "MCAP",
+            Self::Database(_) => "ROS 2 bag",
+        }
+    }
+
+    fn messages(&self) -> Box<dyn MessageSource> {
+        match self {
+            Self::Bag(file) => Box::new(Bag::new(file.clone())),
+            Self::Mcap(file) => Box::new(Unpacked::new(Box::new(McapFile::new(file.clone())))),
+            Self::Database(file) => Box::new(Unpacked::new(Box::new(file.messages()))),
         }
     }
 }
@@ -84,7 +173,10 @@ pub fn open_with_faults(
         Contents::Folder(folder) => {
             let (summary, listing) = *folder;
             let stereo = listing.stereo.clone();
-            let source = FaultySource::new(FolderSource::new(listing, log, imu), faults, imu);
+            let registration = listing.registration.clone();
+            let source = UnitedSource::new(FolderSource::new(listing, log, imu), imu);
+            let source = RegisteredSource::new(source, registration);
+            let source = FaultySource::new(source, faults, imu);
             match stereo {
                 Some(rig) => stereo_log(source, summary, rig, log),
                 None => {
@@ -100,7 +192,7 @@ pub fn open_with_faults(
             let place = (path, messages.kind());
             let (source, summary, rig) =
                 RosSource::new(messages.messages(), &survey, place, log, imu)?;
-            let source = FaultySource::new(source, faults, imu);
+            let source = FaultySource::new(UnitedSource::new(source, imu), faults, imu);
             match rig {
                 Some(rig) => stereo_log(source, summary, rig, log),
                 None => Box::new(MergedLog::new(source, summary, log)),
@@ -141,39 +233,25 @@ impl Contents {
         let unknown =
             |reason: String| Err(LogError::UnknownFormat { path: path.to_path_buf(), reason });
         let folder = |contents| Self::Folder(Box::new(contents));
-        let messages =
-            |format| LogFile::open(path).map(|file| Self::Messages(MessageLog { file, format }));
         if std::fs::metadata(path).map_err(failed)?.is_dir() {
             return match () {
+                () if openloris::is_openloris(path) => openloris::list(path, config).map(folder),
+                () if stray::is_stray(path) => stray::list(path, config).map(folder),
                 () if tum::is_tum(path) => tum::list(path, config).map(folder),
                 () if seven_scenes::is_seven_scenes(path) => {
                     seven_scenes::list(path, config).map(folder)
                 }
                 () if euroc::is_euroc(path) => euroc::list(path, config).map(folder),
                 () if path.ends_with("mav0") || path.join("mav0").is_dir() => {
-                    unknown("a EuRoC folder without cam0/sensor.yaml".to_owned())
+                    unknown("a EuRoC folder without cam0/data.csv".to_owned())
                 }
-                () if path.join("metadata.yaml").is_file() => {
-                    unknown("a ROS 2 bag folder; name the .mcap file in it".to_owned())
-                }
+                () if rosbag2::is_rosbag2(path) => MessageLog::of_folder(path).map(Self::Messages),
                 () => unknown("a folder without rgb.txt and without frame-*.color.*".to_owned()),
             };
         }
-        let mut start = Vec::new();
-        let file = std::fs::File::open(path).map_err(failed)?;
-        file.take(16).read_to_end(&mut start).map_err(failed)?;
-        match () {
-            () if start.starts_with(McapFormat::MAGIC) => messages(MessageFormat::Mcap),
-            () if start.starts_with(BagFormat::MAGIC) => messages(MessageFormat::Bag),
-            () if start.is_empty() => unknown("the file is empty".to_owned()),
-            () if start.starts_with(b"SQLite format 3") => {
-                unknown("a ROS 2 bag in SQLite; `ros2 bag convert` makes it MCAP".to_owned())
-            }
-            () if start.starts_with(b"#ROSBAG") => {
-                unknown("a bag of a format before 2.0; `rosbag migrate` updates it".to_owned())
-            }
-            () => unknown(format!("it begins with `{}`", start.escape_ascii())),
-        }
+        let file = MessageFile::open(path)?;
+        let kind = file.kind();
+        Ok(Self::Messages(MessageLog { files: vec![file], kind }))
     }
 }
 
@@ -411,7 +489,7 @@ mod tests {
     }
 
     #[test]
-    fn color_in_three_channels_and_depth_of_its_size_are_preferred() {
+    fn color_in_three_channels_and_depth_that_is_nothing_else_are_preferred() {
         let folder = tempfile::tempdir().unwrap();
         let mut samples = vec![
             samples::image(false, "/a/mono", "mono8", 1, 1000, 1),
@@ -420,7 +498,7 @@ mod tests {
         samples.extend(samples::recording(false));
         let summary = detect(&bag(&folder, &samples)).unwrap();
         assert_eq!(summary.sources["color"], samples::COLOR);
-        assert_eq!(summary.sources["depth"], "/b/ir");
+        assert_eq!(summary.sources["depth"], samples::DEPTH);
         let mono: Vec<_> =
             samples.into_iter().filter(|sample| sample.topic != samples::COLOR).collect();
         assert_eq!(detect(&bag(&folder, &mono)).unwrap().sources["color"], "/a/mono");
@@ -473,13 +551,13 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = |name: &str, bytes: &[u8]| samples::file(&folder, name, bytes);
         assert!(error(&file("a", b"")).contains("the file is empty"));
-        assert!(error(&file("b", b"SQLite format 3\0")).contains("ros2 bag convert"));
+        assert!(error(&file("b", b"SQLite format 3\0")).contains("no ROS 2 bag that can be read"));
         assert!(error(&file("c", b"#ROSBAG V1.2\n")).contains("before 2.0"));
         assert!(error(&file("d", b"hello")).contains("it begins with `hello`"));
         assert!(error(&folder.path().join("absent")).contains("absent"));
         assert!(error(folder.path()).contains("a folder without rgb.txt"));
         std::fs::create_dir(folder.path().join("mav0")).unwrap();
-        assert!(error(folder.path()).contains("EuRoC folder without cam0/sensor.yaml"));
+        assert!(error(folder.path()).contains("EuRoC folder without cam0/data.csv"));
     }
 
     #[test]

@@ -1,10 +1,8 @@
 //! Pixels as they are logged, to [`ColorImage`] and [`DepthImage`].
 
-use std::io::Cursor;
-
-use image::{DynamicImage, ImageFormat, ImageReader, Limits};
-
 use super::LogConfig;
+use super::demosaic::{bayer_to_rgb, yuv420_to_rgb, yuv422_to_rgb};
+use super::encoding::{ColorEncoding, DepthEncoding, Order, SUPPORTED_COLOR, SUPPORTED_DEPTH};
 use crate::sensor::{ColorImage, DepthImage, PixelFormat};
 
 /// Why a message was left out: a fixed reason to count by, and what was wrong in this one.
@@ -33,7 +31,7 @@ pub(super) struct RawImage<'a> {
 }
 
 /// Decoded images may take at most this much memory, bytes (a color image of 50 megapixels).
-const LARGEST_IMAGE: u64 = 150 << 20;
+pub(super) const LARGEST_IMAGE: u64 = 150 << 20;
 
 /// Metres per unit of depth images that were logged in floating-point metres.
 const FLOAT_DEPTH_SCALE: f32 = 0.001;
@@ -56,6 +54,8 @@ impl<'a> RawImage<'a> {
         let Some((row, step, needed)) = size() else {
             return Err(Rejection::new("absurd size", format!("{width}x{height}")));
         };
+        // A step that contradicts the rest of the message is wrong where the rows fill it exactly.
+        let step = if self.data.len() == row * height { row } else { step };
         if step < row {
             let detail = format!("step {step} for {width} pixels of {pixel_size} bytes");
             return Err(Rejection::new("row step too short", detail));
@@ -67,61 +67,126 @@ impl<'a> RawImage<'a> {
         Ok(self.data.chunks(step).take(height).map(move |padded| &padded[..row]))
     }
 
-    fn is_packed(&self, pixel_size: usize) -> bool {
-        self.step == 0 || self.step as usize == self.width as usize * pixel_size
-    }
-
     /// All bytes in row order: one copy of the message.
     fn packed(&self, pixel_size: usize) -> Result<Vec<u8>, Rejection> {
         let rows = self.rows(pixel_size)?;
         let length = self.width as usize * self.height as usize * pixel_size;
-        if self.is_packed(pixel_size) {
-            return Ok(self.data[..length].to_vec());
-        }
         let mut bytes = Vec::with_capacity(length);
         rows.for_each(|row| bytes.extend_from_slice(row));
         Ok(bytes)
     }
 }
 
-/// Channel layout of a color encoding; `None` if it is none that is read.
-pub(super) fn color_format(encoding: &str, config: &LogConfig) -> Option<PixelFormat> {
-    match encoding {
-        "rgb8" => Some(PixelFormat::Rgb8),
-        "bgr8" => Some(PixelFormat::Bgr8),
-        "8UC3" if config.color_8uc3 == "rgb" => Some(PixelFormat::Rgb8),
-        "8UC3" => Some(PixelFormat::Bgr8),
-        "mono8" | "8UC1" => Some(PixelFormat::Mono8),
-        _ => None,
-    }
-}
-
-pub(super) fn is_depth_encoding(encoding: &str) -> bool {
-    matches!(encoding, "16UC1" | "mono16" | "32FC1")
+/// The reason to leave out an image of an encoding that is not read.
+pub(super) fn unsupported(encoding: &str, supported: &str) -> Rejection {
+    let detail =
+        format!("encoding {} is not supported; supported are {supported}", encoding.trim());
+    Rejection::new("unsupported encoding", detail)
 }
 
 pub(super) fn raw_color(raw: &RawImage, config: &LogConfig) -> Result<ColorImage, Rejection> {
-    let format = color_format(raw.encoding, config)
-        .ok_or_else(|| Rejection::new("unsupported encoding", raw.encoding))?;
-    let data = raw.packed(format.channels())?;
+    let encoding = ColorEncoding::parse(raw.encoding, config)
+        .ok_or_else(|| unsupported(raw.encoding, SUPPORTED_COLOR))?;
+    let size = (raw.width as usize, raw.height as usize);
+    let (format, data) = match encoding {
+        ColorEncoding::Channels { order, bytes } => channels(raw, order, bytes)?,
+        ColorEncoding::Bayer { first, bytes } => {
+            let mosaic = bytes_of(raw, 1, bytes)?;
+            (PixelFormat::Rgb8, bayer_to_rgb(&mosaic, size, first))
+        }
+        ColorEncoding::Yuv422(order) => {
+            require_even(raw, false)?;
+            (PixelFormat::Rgb8, yuv422_to_rgb(&raw.packed(2)?, order))
+        }
+        ColorEncoding::Yuv420 { u_first } => {
+            require_even(raw, true)?;
+            let planes = RawImage { height: raw.height / 2 * 3, ..*raw }.packed(1)?;
+            let (luminance, chroma) = planes.split_at(size.0 * size.1);
+            (PixelFormat::Rgb8, yuv420_to_rgb(luminance, chroma, size.0, u_first))
+        }
+    };
     new_color(raw.width, raw.height, format, data)
 }
 
+fn require_even(raw: &RawImage, height_too: bool) -> Result<(), Rejection> {
+    let is_even = raw.width % 2 == 0 && (!height_too || raw.height % 2 == 0);
+    let detail = || format!("{}x{} pixels of {}", raw.width, raw.height, raw.encoding);
+    is_even
+        .then_some(())
+        .ok_or_else(|| Rejection::new("odd size of an image with shared chroma", detail()))
+}
+
+/// Channels as they are, without an opaque fourth one.
+fn channels(
+    raw: &RawImage,
+    order: Order,
+    bytes: usize,
+) -> Result<(PixelFormat, Vec<u8>), Rejection> {
+    let data = bytes_of(raw, order.channels(), bytes)?;
+    Ok(match order {
+        Order::Grey => (PixelFormat::Mono8, data),
+        Order::Rgb => (PixelFormat::Rgb8, data),
+        Order::Bgr => (PixelFormat::Bgr8, data),
+        Order::Rgba => (PixelFormat::Rgb8, first_three(&data)),
+        Order::Bgra => (PixelFormat::Bgr8, first_three(&data)),
+    })
+}
+
+fn first_three(data: &[u8]) -> Vec<u8> {
+    let mut kept = Vec::with_capacity(data.len() / 4 * 3);
+    for [first, second, third, _] in data.as_chunks::<4>().0 {
+        kept.extend([*first, *second, *third]);
+    }
+    kept
+}
+
+/// One byte a channel; of values of 16 bits 65535 becomes 255.
+fn bytes_of(raw: &RawImage, channels: usize, bytes: usize) -> Result<Vec<u8>, Rejection> {
+    if bytes == 1 {
+        return raw.packed(channels);
+    }
+    let read = if raw.big_endian { u16::from_be_bytes } else { u16::from_le_bytes };
+    let values = raw.packed(2 * channels)?;
+    Ok(values.as_chunks::<2>().0.iter().map(|value| to_byte(read(*value))).collect())
+}
+
+fn to_byte(value: u16) -> u8 {
+    ((u32::from(value) * 255 + 32767) / 65535) as u8
+}
+
 pub(super) fn raw_depth(raw: &RawImage, config: &LogConfig) -> Result<DepthImage, Rejection> {
-    match raw.encoding {
-        "16UC1" | "mono16" => {
+    match DepthEncoding::parse(raw.encoding) {
+        Some(DepthEncoding::U16) => {
             let read = if raw.big_endian { u16::from_be_bytes } else { u16::from_le_bytes };
-            let mut data = values(raw, read)?;
-            clear_invalid(&mut data, config);
-            new_depth(raw.width, raw.height, config.depth_scale as f32, data)
+            depth_of_units(raw.width, raw.height, values(raw, read)?, config)
         }
-        "32FC1" => {
+        Some(DepthEncoding::F32) => {
             let read = if raw.big_endian { f32::from_be_bytes } else { f32::from_le_bytes };
             let data = values(raw, |bytes| millimetres(read(bytes)))?;
             new_depth(raw.width, raw.height, FLOAT_DEPTH_SCALE, data)
         }
-        other => Err(Rejection::new("unsupported encoding", other)),
+        None => Err(unsupported(raw.encoding, SUPPORTED_DEPTH)),
     }
+}
+
+/// Depth in the configured unit, what means "none" there cleared.
+pub(super) fn depth_of_units(
+    width: u32,
+    height: u32,
+    mut data: Vec<u16>,
+    config: &LogConfig,
+) -> Result<DepthImage, Rejection> {
+    clear_invalid(&mut data, config);
+    new_depth(width, height, config.depth_scale as f32, data)
+}
+
+/// Depth in metres; what is no distance, or too far for 16 bits, becomes none.
+pub(super) fn depth_of_metres(
+    width: u32,
+    height: u32,
+    metres: impl Iterator<Item = f32>,
+) -> Result<DepthImage, Rejection> {
+    new_depth(width, height, FLOAT_DEPTH_SCALE, metres.map(millimetres).collect())
 }
 
 fn values<const N: usize>(
@@ -150,61 +215,7 @@ fn clear_invalid(data: &mut [u16], config: &LogConfig) {
     }
 }
 
-/// A JPEG or PNG file in memory.
-pub(super) fn compressed_color(bytes: &[u8]) -> Result<ColorImage, Rejection> {
-    let image = decompress(bytes)?;
-    let (width, height) = (image.width(), image.height());
-    match image {
-        DynamicImage::ImageLuma8(grey) => {
-            new_color(width, height, PixelFormat::Mono8, grey.into_raw())
-        }
-        DynamicImage::ImageRgb8(color) => {
-            new_color(width, height, PixelFormat::Rgb8, color.into_raw())
-        }
-        DynamicImage::ImageRgba8(_) => {
-            new_color(width, height, PixelFormat::Rgb8, image.into_rgb8().into_raw())
-        }
-        other => Err(Rejection::new("unsupported encoding", format!("{:?}", other.color()))),
-    }
-}
-
-/// A PNG file of 16 bits in memory.
-pub(super) fn compressed_depth(bytes: &[u8], config: &LogConfig) -> Result<DepthImage, Rejection> {
-    let image = decompress(bytes)?;
-    let (width, height) = (image.width(), image.height());
-    let DynamicImage::ImageLuma16(depth) = image else {
-        return Err(Rejection::new("unsupported encoding", format!("{:?}", image.color())));
-    };
-    let mut data = depth.into_raw();
-    clear_invalid(&mut data, config);
-    new_depth(width, height, config.depth_scale as f32, data)
-}
-
-/// Width and height of a JPEG or PNG file in memory, by its head.
-pub(super) fn compressed_size(bytes: &[u8]) -> Option<(u32, u32)> {
-    compressed(bytes).ok()?.into_dimensions().ok()
-}
-
-fn decompress(bytes: &[u8]) -> Result<DynamicImage, Rejection> {
-    compressed(bytes)?
-        .decode()
-        .map_err(|error| Rejection::new("cannot be decompressed", error.to_string()))
-}
-
-fn compressed(bytes: &[u8]) -> Result<ImageReader<Cursor<&[u8]>>, Rejection> {
-    let format = match bytes {
-        [0xff, 0xd8, ..] => ImageFormat::Jpeg,
-        [0x89, b'P', b'N', b'G', ..] => ImageFormat::Png,
-        _ => return Err(Rejection::new("neither JPEG nor PNG", "")),
-    };
-    let mut limits = Limits::default();
-    limits.max_alloc = Some(LARGEST_IMAGE);
-    let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
-    reader.limits(limits);
-    Ok(reader)
-}
-
-fn new_color(
+pub(super) fn new_color(
     width: u32,
     height: u32,
     format: PixelFormat,
@@ -231,12 +242,6 @@ mod tests {
         result.unwrap_err().reason
     }
 
-    fn png(image: DynamicImage) -> Vec<u8> {
-        let mut bytes = Cursor::new(Vec::new());
-        image.write_to(&mut bytes, ImageFormat::Png).unwrap();
-        bytes.into_inner()
-    }
-
     #[test]
     fn channel_order_follows_the_encoding_and_8uc3_the_configuration() {
         let rgb = LogConfig { color_8uc3: "rgb".to_owned(), ..LogConfig::default() };
@@ -253,6 +258,26 @@ mod tests {
             let image = raw_color(&raw(encoding, (2, 1), &[1, 2]), &LogConfig::default()).unwrap();
             assert_eq!(image.format(), PixelFormat::Mono8);
         }
+    }
+
+    #[test]
+    fn wider_pixels_become_three_bytes_or_one() {
+        let config = LogConfig::default();
+        let check = |encoding: &str, size, data: &[u8], format, expected: &[u8]| {
+            let image = raw_color(&raw(encoding, size, data), &config).unwrap();
+            assert_eq!((image.format(), image.data()), (format, expected), "{encoding}");
+        };
+        check("bgra8", (2, 1), &[1, 2, 3, 9, 4, 5, 6, 9], PixelFormat::Bgr8, &[1, 2, 3, 4, 5, 6]);
+        check("RGBA8", (1, 1), &[1, 2, 3, 9], PixelFormat::Rgb8, &[1, 2, 3]);
+        check("8UC4", (1, 1), &[1, 2, 3, 9], PixelFormat::Bgr8, &[1, 2, 3]);
+        // 65535 / 257 = 255, 0x0180 / 257 = 1.49.
+        check("mono16", (2, 1), &[0xff, 0xff, 0x80, 0x01], PixelFormat::Mono8, &[255, 1]);
+        check("rgb16", (1, 1), &[0, 0, 1, 1, 2, 2], PixelFormat::Rgb8, &[0, 1, 2]);
+        check("bayer_rggb16", (1, 1), &[0, 7], PixelFormat::Rgb8, &[7; 3]);
+        check("yuv422", (2, 1), &[128, 16, 128, 235], PixelFormat::Rgb8, &[0, 0, 0, 255, 255, 255]);
+        check("nv21", (2, 2), &[16, 16, 16, 16, 128, 128], PixelFormat::Rgb8, &[0; 12]);
+        let big = RawImage { big_endian: true, ..raw("mono16", (1, 1), &[7, 0]) };
+        assert_eq!(raw_color(&big, &config).unwrap().data(), [7]);
     }
 
     #[test]
@@ -294,41 +319,22 @@ mod tests {
         assert_eq!(color(raw("rgb8", (u32::MAX, u32::MAX), &[0; 11])), "absurd size");
         assert_eq!(color(raw("mono8", (u32::MAX, 1), &[0; 11])), "buffer too short");
         assert_eq!(color(raw("rgb8", (0, 2), &[])), "no pixels");
-        assert_eq!(color(raw("bayer_rggb8", (2, 2), &[0; 4])), "unsupported encoding");
+        assert_eq!(color(raw("8SC3", (2, 2), &[0; 12])), "unsupported encoding");
+        assert_eq!(color(raw("nv12", (2, 2), &[0; 5])), "buffer too short");
+        for encoding in ["nv12", "yuv422"] {
+            let odd = color(raw(encoding, (3, 2), &[0; 12]));
+            assert_eq!(odd, "odd size of an image with shared chroma");
+        }
         let narrow = RawImage { step: 5, ..raw("rgb8", (2, 2), &[0; 100]) };
         assert_eq!(color(narrow), "row step too short");
+        // The rows alone fill the buffer: it is the step that is wrong.
+        let pixels = [1, 0, 2, 0, 3, 0, 4, 0];
+        let narrow = RawImage { step: 2, ..raw("16UC1", (2, 2), &pixels) };
+        assert_eq!(raw_depth(&narrow, &config).unwrap().data(), [1, 2, 3, 4]);
         assert_eq!(
             reason(raw_depth(&raw("rgb8", (1, 1), &[0; 3]), &config)),
             "unsupported encoding"
         );
         assert_eq!(reason(raw_depth(&raw("16UC1", (2, 2), &[0; 7]), &config)), "buffer too short");
-    }
-
-    #[test]
-    fn png_and_jpeg_are_decompressed() {
-        let config = LogConfig::default();
-        let depth = image::ImageBuffer::from_vec(2, 1, vec![1000_u16, 65535]).unwrap();
-        let file = png(DynamicImage::ImageLuma16(depth));
-        assert_eq!(compressed_depth(&file, &config).unwrap().data(), [1000, 0]);
-        assert_eq!(reason(compressed_color(&file)), "unsupported encoding");
-        let color = image::RgbImage::from_pixel(8, 8, image::Rgb([200, 100, 50]));
-        let file = png(DynamicImage::ImageRgb8(color.clone()));
-        assert_eq!(compressed_color(&file).unwrap().data(), color.as_raw());
-        let mut jpeg = Cursor::new(Vec::new());
-        DynamicImage::ImageRgb8(color).write_to(&mut jpeg, ImageFormat::Jpeg).unwrap();
-        let image = compressed_color(jpeg.get_ref()).unwrap();
-        assert!(image.format() == PixelFormat::Rgb8 && image.data()[0].abs_diff(200) < 4);
-    }
-
-    #[test]
-    fn damaged_files_are_rejected() {
-        let grey = image::GrayImage::from_pixel(64, 64, image::Luma([9]));
-        let file = png(DynamicImage::ImageLuma8(grey));
-        assert_eq!(reason(compressed_color(&file[..40])), "cannot be decompressed");
-        assert_eq!(reason(compressed_color(b"GIF89a")), "neither JPEG nor PNG");
-        // A header that claims 65535 x 65535 pixels.
-        let mut huge = file;
-        huge[16..24].copy_from_slice(&[0, 0, 255, 255, 0, 0, 255, 255]);
-        assert_eq!(reason(compressed_color(&huge)), "cannot be decompressed");
     }
 }

@@ -140,7 +140,7 @@ impl<F: Format> Records<F> {
             RecordKind::Chunk => self.open_chunk(start, head, report)?,
             RecordKind::Message | RecordKind::Declaration => {
                 let Self { format, reader, only, data, .. } = self;
-                let body = Body { head, place: Place { offset: start, record: None } };
+                let body = Body { head, place: Place::Record(start) };
                 return body.read(reader, format, (&*only, data), report, visitor);
             }
             RecordKind::Other if self.position > self.file.size() => {
@@ -180,7 +180,7 @@ impl<F: Format> Records<F> {
         let Self { chunk, format, only, data, .. } = self;
         let OpenChunk { content, start, records } = chunk.as_mut()?;
         *records += 1;
-        let place = Place { offset: *start, record: Some(*records) };
+        let place = Place::Chunk(*start, *records);
         let head = match format.read_head(content) {
             Ok(head) => head?,
             Err(error) => return Some(Err((place, error))),

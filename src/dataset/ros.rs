@@ -4,16 +4,16 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::Path;
 
-use super::merge::{Reading, ReadingSource};
+use super::compressed::CompressedHead;
+use super::decode::Decoder;
+use super::encoding::{ColorEncoding, DepthEncoding, SUPPORTED_COLOR, SUPPORTED_DEPTH};
 use super::message::{self, Fields, MessageType, Serialization};
-use super::pixels::{
-    Rejection, color_format, compressed_color, compressed_depth, compressed_size,
-    is_depth_encoding, raw_color, raw_depth,
-};
+use super::navigation::NavigationTopics;
+use super::pixels::Rejection;
 use super::write::{CAMERA, CONFIGURATION};
 use super::{LogConfig, LogError, LogSummary, ReadReport};
 use crate::inertial::ImuConfig;
-use crate::sensor::{CameraConfig, PixelFormat, Stamp};
+use crate::sensor::{CameraConfig, Stamp};
 use crate::vision::StereoRig;
 
 /// A connection of a bag or a channel of an MCAP file.
@@ -39,20 +39,25 @@ impl Channel {
     }
 }
 
-/// Where a record is in its file.
+/// Where a message is in its file.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
-    /// Of the record, or of the chunk that contains it, bytes.
-    pub offset: u64,
-    /// Number of the record in its chunk, from 1.
-    pub record: Option<u64>,
+pub(super) enum Place {
+    /// Where its record begins, bytes.
+    Record(u64),
+    /// Where the chunk that contains it begins, bytes, and the number of its record there, from 1.
+    Chunk(u64, u64),
+    /// Its row in a database.
+    Row(i64),
 }
 
 impl fmt::Display for Place {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.record {
-            Some(record) => write!(f, "record {record} of the chunk at byte {}", self.offset),
-            None => write!(f, "record at byte {}", self.offset),
+        match self {
+            Self::Record(offset) => write!(f, "record at byte {offset}"),
+            Self::Chunk(offset, record) => {
+                write!(f, "record {record} of the chunk at byte {offset}")
+            }
+            Self::Row(row) => write!(f, "row {row}"),
         }
     }
 }
@@ -89,24 +94,33 @@ pub(super) trait MessageSource: Send {
 pub(super) enum Role {
     Color,
     Depth,
+    /// The IMU, or its gyroscope where the accelerometer has a topic of its own.
     Imu,
+    Accelerometer,
     Truth,
     /// The right one of two cameras.
     Right,
+    Gnss,
+    Magnetic,
 }
 
 impl Role {
-    /// A topic is chosen for the right camera once it is known that there is no depth.
-    const ALL: [Self; 5] = [Self::Color, Self::Depth, Self::Right, Self::Imu, Self::Truth];
+    /// What odometry uses. A topic is chosen for the right camera once it is known that there is no
+    /// depth, and for the accelerometer once that for the gyroscope is known.
+    const ALL: [Self; 6] =
+        [Self::Color, Self::Depth, Self::Right, Self::Imu, Self::Accelerometer, Self::Truth];
 
     /// Its key in [`LogSummary::sources`].
-    fn key(self) -> &'static str {
+    pub fn key(self) -> &'static str {
         match self {
             Self::Color => "color",
             Self::Depth => "depth",
             Self::Imu => "imu",
+            Self::Accelerometer => "accelerometer",
             Self::Truth => "truth",
             Self::Right => "right",
+            Self::Gnss => "gnss",
+            Self::Magnetic => "magnetic",
         }
     }
 
@@ -119,26 +133,33 @@ impl Role {
             Self::Color => "color image",
             Self::Depth => "depth image",
             Self::Imu => "imu",
+            Self::Accelerometer => "accelerometer",
             Self::Truth => "truth",
             Self::Right => "right image",
+            Self::Gnss => "gnss",
+            Self::Magnetic => "magnetic field",
         }
     }
 
-    fn configured(self, config: &LogConfig) -> &str {
+    pub fn configured(self, config: &LogConfig) -> &str {
         match self {
             Self::Color => &config.color_topic,
             Self::Depth => &config.depth_topic,
             Self::Imu => &config.imu_topic,
+            Self::Accelerometer => &config.accel_topic,
             Self::Truth => &config.truth_topic,
             Self::Right => &config.right_topic,
+            Self::Gnss | Self::Magnetic => "none",
         }
     }
 
-    fn takes(self, kind: MessageType) -> bool {
+    pub fn takes(self, kind: MessageType) -> bool {
         use MessageType::*;
         match self {
             Self::Color | Self::Depth | Self::Right => matches!(kind, Image | CompressedImage),
-            Self::Imu => kind == Imu,
+            Self::Imu | Self::Accelerometer => kind == Imu,
+            Self::Gnss => matches!(kind, NavSatFix | NmeaSentence),
+            Self::Magnetic => matches!(kind, MagneticField | Vector3Stamped),
             Self::Truth => matches!(kind, PoseStamped | TransformStamped | Odometry),
         }
     }
@@ -148,8 +169,8 @@ impl Role {
 const SURVEY_MESSAGES: usize = 10_000;
 const SURVEY_BYTES: usize = 64 << 20;
 
-/// IMU samples looked at to tell g from m/s^2.
-const SURVEY_IMU_SAMPLES: usize = 10;
+/// IMU messages looked at to tell g from m/s^2, and which halves of an IMU they hold.
+const SURVEY_IMU_SAMPLES: usize = 40;
 
 /// Median specific force below this is taken for g, above for m/s^2.
 const LARGEST_MEDIAN_IN_G: f64 = 4.0;
@@ -159,11 +180,45 @@ const LARGEST_MEDIAN_IN_G: f64 = 4.0;
 struct Topic {
     schema: String,
     kind: Option<MessageType>,
-    /// Of the first image, and its width and height where they are known.
-    encoding: Option<String>,
-    size: Option<(u32, u32)>,
+    /// Of the first image.
+    image: Option<ImageHead>,
     /// Norms of the first accelerometer readings, as logged.
     accelerations: Vec<f64>,
+    halves: Halves,
+}
+
+/// How many of a topic's first IMU messages hold which halves of an IMU; a half is not there if its
+/// covariance says so, or if it is zero to the last bit.
+#[derive(Debug, Clone, Copy, Default)]
+struct Halves {
+    both: usize,
+    gyroscope: usize,
+    accelerometer: usize,
+}
+
+/// What the messages of an IMU topic hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ImuContent {
+    Whole,
+    Gyroscope,
+    Accelerometer,
+    /// Now the one, now the other.
+    Alternating,
+}
+
+impl Halves {
+    fn count(&self) -> usize {
+        self.both + self.gyroscope + self.accelerometer
+    }
+
+    fn content(&self) -> ImuContent {
+        match self {
+            Self { both: 0, gyroscope: 0, accelerometer: 1.. } => ImuContent::Accelerometer,
+            Self { both: 0, gyroscope: 1.., accelerometer: 0 } => ImuContent::Gyroscope,
+            Self { both: 0, gyroscope: 1.., accelerometer: 1.. } => ImuContent::Alternating,
+            _ => ImuContent::Whole,
+        }
+    }
 }
 
 impl Topic {
@@ -171,10 +226,14 @@ impl Topic {
         Self {
             schema: channel.schema.clone(),
             kind: channel.readable().map(|(kind, _)| kind),
-            encoding: None,
-            size: None,
+            image: None,
             accelerations: Vec::new(),
+            halves: Halves::default(),
         }
+    }
+
+    fn size(&self) -> Option<(u32, u32)> {
+        self.image.as_ref()?.size
     }
 
     fn is_image(&self) -> bool {
@@ -183,16 +242,19 @@ impl Topic {
 
     fn observe(&mut self, message: &Message) -> Result<(), Rejection> {
         match message.channel.readable() {
-            Some((MessageType::Imu, serialization))
-                if self.accelerations.len() < SURVEY_IMU_SAMPLES =>
-            {
+            Some((MessageType::Imu, serialization)) if self.halves.count() < SURVEY_IMU_SAMPLES => {
                 let fields = Fields::new(message.data, serialization)?;
-                let sample = message::imu(fields, &ImuConfig::default())?;
-                self.accelerations.push(sample.specific_force.norm());
+                let reading = message::imu(fields, &ImuConfig::default())?.without_zeros();
+                let halves = &mut self.halves;
+                match (reading.angular_velocity, reading.specific_force) {
+                    (Some(_), Some(_)) => halves.both += 1,
+                    (Some(_), None) => halves.gyroscope += 1,
+                    (None, Some(_)) => halves.accelerometer += 1,
+                    (None, None) => halves.both += 1,
+                }
+                self.accelerations.extend(reading.specific_force.map(|force| force.norm()));
             }
-            _ if self.encoding.is_none() => {
-                (self.encoding, self.size) = encoding_and_size(message)?;
-            }
+            _ if self.image.is_none() => self.image = ImageHead::of(message)?,
             _ => {}
         }
         Ok(())
@@ -201,24 +263,38 @@ impl Topic {
     /// How well it suits `role`, smaller being better; `None` if not at all.
     fn rank(&self, name: &str, role: Role, color_size: Option<(u32, u32)>) -> Option<u32> {
         let kind = self.kind.filter(|kind| role.takes(*kind))?;
-        let encoding = self.encoding.as_deref();
+        let raw = kind == MessageType::Image;
         match role {
-            Role::Color if kind == MessageType::Image => {
-                color_format(encoding?, &LogConfig::default())
-                    .map(|format| if format == PixelFormat::Mono8 { 2 } else { 0 })
-            }
-            Role::Color => match encoding? {
-                format if message::is_depth_format(format) => None,
-                format => Some(if format.contains("mono8") { 3 } else { 1 }),
+            Role::Color => match self.image.as_ref()?.usage {
+                ImageUsage::Color { is_grey } => {
+                    Some(if is_grey { 2 } else { 0 } + u32::from(!raw))
+                }
+                ImageUsage::GreyOrDepth => Some(4),
+                ImageUsage::Depth | ImageUsage::Unsupported => None,
             },
-            Role::Depth if kind == MessageType::Image => {
-                is_depth_encoding(encoding?).then_some(u32::from(self.size != color_size))
-            }
-            Role::Depth => message::is_depth_format(encoding?).then_some(2),
+            Role::Depth => match self.image.as_ref()?.usage {
+                ImageUsage::Depth if raw => Some(u32::from(self.size() != color_size)),
+                ImageUsage::Depth => Some(2),
+                ImageUsage::GreyOrDepth => Some(3),
+                ImageUsage::Color { .. } | ImageUsage::Unsupported => None,
+            },
             Role::Right => {
-                self.rank(name, Role::Color, color_size).filter(|_| self.size == color_size)
+                self.rank(name, Role::Color, color_size).filter(|_| self.size() == color_size)
             }
-            Role::Imu => Some(u32::from(self.accelerations.is_empty())),
+            Role::Imu => Some(match self.halves.content() {
+                _ if self.halves.count() == 0 => 4,
+                ImuContent::Whole => 0,
+                ImuContent::Alternating => 1,
+                ImuContent::Gyroscope => 2,
+                ImuContent::Accelerometer => 3,
+            }),
+            Role::Accelerometer => None,
+            Role::Gnss => Some(u32::from(kind == MessageType::NmeaSentence)),
+            // Vectors of any kind are published so.
+            Role::Magnetic if kind == MessageType::Vector3Stamped => {
+                name.to_lowercase().contains("mag").then_some(1)
+            }
+            Role::Magnetic => Some(0),
             Role::Truth => match kind {
                 MessageType::PoseStamped => Some(0),
                 MessageType::TransformStamped => Some(1),
@@ -238,23 +314,75 @@ impl Topic {
     }
 }
 
-type EncodingAndSize = (Option<String>, Option<(u32, u32)>);
+/// What an image message says of itself.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct ImageHead {
+    /// Name of the encoding or, of a compressed image, of its format.
+    pub encoding: String,
+    /// Width and height, where they are told.
+    pub size: Option<(u32, u32)>,
+    usage: ImageUsage,
+}
 
-/// Encoding, width and height of an image, as far as the message tells them.
-pub(super) fn encoding_and_size(message: &Message) -> Result<EncodingAndSize, Rejection> {
-    let Some((kind, serialization)) = message.channel.readable() else { return Ok((None, None)) };
-    let fields = Fields::new(message.data, serialization)?;
-    Ok(match kind {
-        MessageType::Image => {
-            let (_, image) = message::image(fields)?;
-            (Some(image.encoding.to_owned()), Some((image.width, image.height)))
+/// What an image may be used as, by its encoding.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum ImageUsage {
+    Color {
+        is_grey: bool,
+    },
+    Depth,
+    /// `mono16`, which is both.
+    GreyOrDepth,
+    Unsupported,
+}
+
+impl ImageHead {
+    /// `None` for a message of another type.
+    pub fn of(message: &Message) -> Result<Option<Self>, Rejection> {
+        let Some((kind, serialization)) = message.channel.readable() else { return Ok(None) };
+        let fields = || Fields::new(message.data, serialization);
+        Ok(match kind {
+            MessageType::Image => {
+                let (_, image) = message::image(fields()?)?;
+                Some(Self::raw(image.encoding, (image.width, image.height)))
+            }
+            MessageType::CompressedImage => {
+                let image = message::compressed_image(fields()?)?;
+                Some(Self::compressed(CompressedHead::of(&image)?))
+            }
+            _ => None,
+        })
+    }
+
+    fn raw(encoding: &str, size: (u32, u32)) -> Self {
+        let color = ColorEncoding::parse(encoding, &LogConfig::default());
+        let usage = match (color, DepthEncoding::parse(encoding)) {
+            (Some(_), Some(_)) => ImageUsage::GreyOrDepth,
+            (Some(color), None) => ImageUsage::Color { is_grey: color.is_grey() },
+            (None, Some(_)) => ImageUsage::Depth,
+            (None, None) => ImageUsage::Unsupported,
+        };
+        Self { encoding: encoding.to_owned(), size: Some(size), usage }
+    }
+
+    fn compressed(head: CompressedHead) -> Self {
+        let usage = match (head.is_supported, head.is_depth) {
+            (true, true) => ImageUsage::Depth,
+            (true, false) => ImageUsage::Color { is_grey: head.encoding.contains("mono8") },
+            (false, _) => ImageUsage::Unsupported,
+        };
+        Self { encoding: head.encoding, size: head.size, usage }
+    }
+
+    /// Whether it can be decoded for `role`.
+    fn suits(&self, role: Role) -> bool {
+        match self.usage {
+            ImageUsage::Color { .. } => role != Role::Depth,
+            ImageUsage::Depth => role == Role::Depth,
+            ImageUsage::GreyOrDepth => true,
+            ImageUsage::Unsupported => false,
         }
-        MessageType::CompressedImage => {
-            let image = message::compressed_image(fields)?;
-            (Some(image.format.to_owned()), compressed_size(image.data))
-        }
-        _ => (None, None),
-    })
+    }
 }
 
 /// The topics of a log, by name.
@@ -286,9 +414,9 @@ impl Survey {
                 bytes += message.data.len();
             });
             let known = |topic: &Topic| {
-                (!topic.is_image() || topic.encoding.is_some())
+                (!topic.is_image() || topic.image.is_some())
                     && (topic.kind != Some(MessageType::Imu)
-                        || topic.accelerations.len() == SURVEY_IMU_SAMPLES)
+                        || topic.halves.count() == SURVEY_IMU_SAMPLES)
             };
             if !more || messages.is_indexed() && topics.values().all(known) {
                 break;
@@ -301,8 +429,8 @@ impl Survey {
 
     /// Topics with their types and encodings, for messages to the user.
     fn describe(&self) -> String {
-        let describe = |(name, topic): (&String, &Topic)| match &topic.encoding {
-            Some(encoding) => format!("{name} ({} {encoding})", topic.schema),
+        let describe = |(name, topic): (&String, &Topic)| match &topic.image {
+            Some(image) => format!("{name} ({} {})", topic.schema, image.encoding),
             None => format!("{name} ({})", topic.schema),
         };
         let topics: Vec<_> = self.topics.iter().map(describe).collect();
@@ -310,7 +438,14 @@ impl Survey {
     }
 
     fn best(&self, role: Role, color_size: Option<(u32, u32)>) -> Option<&String> {
-        let ranked = self.topics.iter().filter_map(|(name, topic)| {
+        let usage = |topic: &Topic| topic.image.as_ref().map(|image| image.usage);
+        let has_depth = self.topics.values().any(|topic| usage(topic) == Some(ImageUsage::Depth));
+        // What may be either is depth unless something else is.
+        let is_open = |topic: &Topic| {
+            has_depth || role != Role::Color || usage(topic) != Some(ImageUsage::GreyOrDepth)
+        };
+        let topics = self.topics.iter().filter(|(_, topic)| is_open(topic));
+        let ranked = topics.filter_map(|(name, topic)| {
             topic.rank(name, role, color_size).map(|rank| (rank, name))
         });
         ranked.min().map(|(_, name)| name)
@@ -345,22 +480,101 @@ impl Survey {
                 "none" => None,
                 "" if role == Role::Depth && has_right => None,
                 "" if role == Role::Right => self.partner(config, &chosen, color_size),
+                "" if role == Role::Accelerometer => self.other_half(&chosen),
                 "" => self.best(role, color_size),
-                wanted => match self.topics.get_key_value(wanted) {
-                    Some((name, topic)) if topic.kind.is_some_and(|kind| role.takes(kind)) => {
-                        Some(name)
-                    }
-                    _ => return Err(role),
-                },
+                wanted => Some(self.configured(role, wanted).ok_or(role)?),
             };
             if let Some(name) = name {
                 if role == Role::Color {
-                    color_size = self.topics.get(name).and_then(|topic| topic.size);
+                    color_size = self.topics.get(name).and_then(Topic::size);
                 }
                 chosen.insert(role, name.clone());
             }
         }
+        if config.imu_topic.is_empty() && self.is_lone_gyroscope(&chosen) {
+            chosen.remove(&Role::Imu);
+        }
         Ok(chosen)
+    }
+
+    /// Whether the chosen IMU is a gyroscope without an accelerometer.
+    fn is_lone_gyroscope(&self, chosen: &BTreeMap<Role, String>) -> bool {
+        let imu = chosen.get(&Role::Imu);
+        imu.is_some_and(|imu| self.imu_content(imu) == ImuContent::Gyroscope)
+            && !chosen.contains_key(&Role::Accelerometer)
+    }
+
+    /// A topic of a gyroscope that cannot be used as no topic has the accelerometer.
+    pub fn lone_gyroscope(&self) -> Option<&String> {
+        let with = |content| self.topics.keys().find(|name| self.imu_content(name) == content);
+        with(ImuContent::Gyroscope).filter(|_| with(ImuContent::Accelerometer).is_none())
+    }
+
+    /// The accelerometer that belongs to the chosen gyroscope: of several the one whose name begins
+    /// like the gyroscope's.
+    fn other_half(&self, chosen: &BTreeMap<Role, String>) -> Option<&String> {
+        let gyroscope = chosen.get(&Role::Imu)?;
+        if self.imu_content(gyroscope) != ImuContent::Gyroscope {
+            return None;
+        }
+        let alike =
+            |name: &str| name.bytes().zip(gyroscope.bytes()).take_while(|(a, b)| a == b).count();
+        let halves =
+            self.topics.keys().filter(|name| self.imu_content(name) == ImuContent::Accelerometer);
+        halves.max_by_key(|name| (alike(name), std::cmp::Reverse(*name)))
+    }
+
+    /// What the messages of an IMU topic hold; [`ImuContent::Whole`] where that is not known.
+    fn imu_content(&self, topic: &str) -> ImuContent {
+        self.topics.get(topic).map_or(ImuContent::Whole, |topic| topic.halves.content())
+    }
+
+    /// How the chosen topics are to be decoded.
+    pub fn decoder(
+        &self,
+        chosen: &BTreeMap<Role, String>,
+        log: &LogConfig,
+        imu: &ImuConfig,
+    ) -> Decoder {
+        let content = match chosen.get(&Role::Imu) {
+            Some(_) if chosen.contains_key(&Role::Accelerometer) => ImuContent::Gyroscope,
+            Some(topic) if self.imu_content(topic) == ImuContent::Alternating => {
+                ImuContent::Alternating
+            }
+            _ => ImuContent::Whole,
+        };
+        Decoder::new(log, imu, content)
+    }
+
+    /// Topics of inertial, magnetic and satellite readings; `Err` names the role of a topic that is
+    /// given and not there. Roles without a topic are left out.
+    pub fn choose_navigation(
+        &self,
+        topics: &NavigationTopics,
+    ) -> Result<BTreeMap<Role, String>, Role> {
+        let mut chosen = BTreeMap::new();
+        let wanted = [
+            (Role::Imu, &topics.imu),
+            (Role::Gnss, &topics.gnss),
+            (Role::Magnetic, &topics.magnetic),
+        ];
+        for (role, wanted) in wanted {
+            let name = match wanted.as_str() {
+                "none" => None,
+                "" => self.best(role, None),
+                wanted => Some(self.configured(role, wanted).ok_or(role)?),
+            };
+            chosen.extend(name.map(|name| (role, name.clone())));
+        }
+        let accelerometer = self.other_half(&chosen).cloned();
+        chosen.extend(accelerometer.map(|name| (Role::Accelerometer, name)));
+        Ok(chosen)
+    }
+
+    /// The topic `wanted`, if it is there and can play `role`.
+    fn configured(&self, role: Role, wanted: &str) -> Option<&String> {
+        let (name, topic) = self.topics.get_key_value(wanted)?;
+        topic.kind.is_some_and(|kind| role.takes(kind)).then_some(name)
     }
 
     /// The second of two cameras, where depth is wanted and not logged.
@@ -374,10 +588,11 @@ impl Survey {
         if chosen.contains_key(&Role::Depth) || !config.depth_topic.is_empty() {
             return None;
         }
-        let encoding = &self.topics.get(color)?.encoding;
+        let encoding = |topic: &Topic| topic.image.as_ref().map(|image| image.encoding.clone());
+        let color_encoding = encoding(self.topics.get(color)?);
         let is_like_color = |name: &String, topic: &Topic| {
             name != color
-                && topic.encoding == *encoding
+                && encoding(topic) == color_encoding
                 && topic.rank(name, Role::Right, color_size).is_some()
         };
         self.topics.iter().find(|(name, topic)| is_like_color(name, topic)).map(|(name, _)| name)
@@ -398,7 +613,7 @@ impl Survey {
             return Err(failed("set their calibrations in `log.stereo`".to_owned()));
         };
         let color = chosen.get(&Role::Color).and_then(|name| self.topics.get(name));
-        let Some((width, height)) = color.and_then(|topic| topic.size) else {
+        let Some((width, height)) = color.and_then(Topic::size) else {
             return Err(failed("no image of the left one could be read".to_owned()));
         };
         StereoRig::new(left, right, (width as usize, height as usize))
@@ -412,8 +627,40 @@ impl Survey {
         self.summary_of(kind, &chosen, None)
     }
 
-    /// `role` is not there.
+    /// The error that `topic` cannot be decoded for `role`, if that is so.
+    pub fn check_encoding(&self, path: &Path, role: Role, topic: &str) -> Result<(), LogError> {
+        let image = self.topics.get(topic).and_then(|topic| topic.image.as_ref());
+        match image.filter(|image| role.is_image() && !image.suits(role)) {
+            Some(image) => Err(LogError::Encoding {
+                path: path.to_path_buf(),
+                topic: topic.to_owned(),
+                encoding: image.encoding.trim().to_owned(),
+                supported: if role == Role::Depth { SUPPORTED_DEPTH } else { SUPPORTED_COLOR },
+            }),
+            None => Ok(()),
+        }
+    }
+
+    /// An image topic that would have been taken for `role`, were its encoding read.
+    fn unreadable(&self, role: Role) -> Option<&String> {
+        let is_depth = |name: &str, image: &ImageHead| {
+            ["depth", "16uc1", "32fc1"].iter().any(|word| {
+                name.to_lowercase().contains(word) || image.encoding.to_lowercase().contains(word)
+            })
+        };
+        let mut topics = self.topics.iter().filter_map(|(name, topic)| {
+            let image = topic.image.as_ref().filter(|i| i.usage == ImageUsage::Unsupported)?;
+            (is_depth(name, image) == (role == Role::Depth)).then_some(name)
+        });
+        topics.next()
+    }
+
+    /// `role` is not there, or not in an encoding that is read.
     pub fn missing(&self, path: &Path, role: Role) -> LogError {
+        let unreadable = self.unreadable(role).filter(|_| role.is_image());
+        if let Some(Err(error)) = unreadable.map(|topic| self.check_encoding(path, role, topic)) {
+            return error;
+        }
         let available = self.describe();
         LogError::MissingStream { path: path.to_path_buf(), role: role.name(), available }
     }
@@ -435,112 +682,6 @@ impl Survey {
                 .collect(),
             frames: None,
             camera: rig.map(StereoRig::camera).or(self.camera.as_ref()).cloned(),
-        }
-    }
-}
-
-/// Decodes the messages of the chosen topics.
-pub(super) struct RosSource {
-    messages: Box<dyn MessageSource>,
-    roles: BTreeMap<String, Role>,
-    log: LogConfig,
-    imu: ImuConfig,
-}
-
-impl RosSource {
-    /// `messages` from the start; `path` and `kind` for errors and the summary. Where depth comes
-    /// from two cameras, these too.
-    pub fn new(
-        mut messages: Box<dyn MessageSource>,
-        survey: &Survey,
-        (path, kind): (&Path, &str),
-        log: &LogConfig,
-        imu: &ImuConfig,
-    ) -> Result<(Self, LogSummary, Option<StereoRig>), LogError> {
-        let missing = |role: Role| survey.missing(path, role);
-        let chosen = survey.choose(log).map_err(missing)?;
-        let rig = survey.rig(path, &chosen, log)?;
-        for role in [Role::Color, Role::Depth] {
-            let is_computed = role == Role::Depth && rig.is_some();
-            if role.configured(log) != "none" && !chosen.contains_key(&role) && !is_computed {
-                return Err(missing(role));
-            }
-        }
-        for (role, topic) in &chosen {
-            if role.configured(log).is_empty() {
-                tracing::info!("{}: {topic} (chosen by message type)", role.name());
-            }
-        }
-        messages.only(chosen.values().cloned().collect());
-        let summary = survey.summary_of(kind, &chosen, rig.as_ref());
-        let roles = chosen.into_iter().map(|(role, topic)| (topic, role)).collect();
-        Ok((Self { messages, roles, log: log.clone(), imu: imu.clone() }, summary, rig))
-    }
-}
-
-impl ReadingSource for RosSource {
-    fn next_reading(&mut self, report: &mut ReadReport) -> Option<Reading> {
-        let Self { messages, roles, log, imu } = self;
-        loop {
-            let mut reading = None;
-            let more = messages.visit_next(report, &mut |message, report| {
-                let topic = &message.channel.topic;
-                let Some(role) = roles.get(topic) else { return };
-                match decode(*role, message, log, imu) {
-                    Ok(decoded) => reading = Some(decoded),
-                    Err(Rejection { reason, detail }) => report.skip(
-                        &format!("{}: {reason}", role.name()),
-                        format_args!("{topic}, {}: {detail}", message.place),
-                    ),
-                }
-            });
-            if reading.is_some() || !more {
-                return reading;
-            }
-        }
-    }
-}
-
-/// The reading of a message that plays `role`.
-pub(super) fn decode(
-    role: Role,
-    message: &Message,
-    log: &LogConfig,
-    imu: &ImuConfig,
-) -> Result<Reading, Rejection> {
-    let channel = message.channel;
-    let Some((kind, serialization)) = channel.readable().filter(|(kind, _)| role.takes(*kind))
-    else {
-        return Err(Rejection::new("unexpected message type", &channel.schema));
-    };
-    let fields = Fields::new(message.data, serialization)?;
-    match (role, kind) {
-        (Role::Imu, _) => message::imu(fields, imu).map(Reading::Imu),
-        (Role::Truth, _) => message::pose(fields, kind).map(Reading::Truth),
-        (Role::Color, MessageType::Image) => {
-            let (stamp, raw) = message::image(fields)?;
-            raw_color(&raw, log).map(|image| Reading::Color(stamp, image))
-        }
-        (Role::Right, MessageType::Image) => {
-            let (stamp, raw) = message::image(fields)?;
-            raw_color(&raw, log).map(|image| Reading::Right(stamp, image))
-        }
-        (Role::Right, _) => {
-            let image = message::compressed_image(fields)?;
-            compressed_color(image.data).map(|color| Reading::Right(image.stamp, color))
-        }
-        (Role::Color, _) => {
-            let image = message::compressed_image(fields)?;
-            compressed_color(image.data).map(|color| Reading::Color(image.stamp, color))
-        }
-        (Role::Depth, MessageType::Image) => {
-            let (stamp, raw) = message::image(fields)?;
-            raw_depth(&raw, log).map(|image| Reading::Depth(stamp, image))
-        }
-        (Role::Depth, _) => {
-            let image = message::compressed_image(fields)?;
-            compressed_depth(image.depth_file()?, log)
-                .map(|depth| Reading::Depth(image.stamp, depth))
         }
     }
 }

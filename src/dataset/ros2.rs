@@ -250,8 +250,6 @@ pub fn definition(kind: MessageType) -> Option<&'static str> {
         MessageType::PoseStamped => Some(POSE_DEFINITION),
         MessageType::CameraInfo => Some(CAMERA_INFO_DEFINITION),
         MessageType::Transforms => Some(TF_DEFINITION),
-        MessageType::CompressedImage | MessageType::TransformStamped | MessageType::Odometry => {
-            None
-        }
+        _ => None,
     }
 }

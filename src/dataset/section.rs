@@ -1,7 +1,7 @@
 //! Bytes of a log file, read as a stream: never more in memory than asked for.
 
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom};
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -29,7 +29,12 @@ pub(super) struct LogFile {
 impl LogFile {
     pub fn open(path: &Path) -> Result<Self, LogError> {
         let failed = |source| LogError::Io { path: path.to_path_buf(), source };
-        let file = File::open(path).map_err(failed)?;
+        Self::of(File::open(path).map_err(failed)?, path)
+    }
+
+    /// A file that is open; `path` for the error that its size cannot be told.
+    pub fn of(file: File, path: &Path) -> Result<Self, LogError> {
+        let failed = |source| LogError::Io { path: path.to_path_buf(), source };
         let size = file.metadata().map_err(failed)?.len();
         Ok(Self { file: Arc::new(file), size })
     }
@@ -112,6 +117,38 @@ impl Read for Section {
         self.position += count as u64;
         Ok(count)
     }
+}
+
+/// Enough to tell the format of a file.
+const FIRST_BYTES: u64 = 64;
+
+/// Writes what `path`, compressed by zstd, contains. What is damaged or cut ends it early, as a log
+/// that is cut does.
+pub(super) fn decompress(path: &Path, output: &mut File) -> Result<(), LogError> {
+    let failed = |source| LogError::Io { path: path.to_path_buf(), source };
+    let mut input = zstd::Decoder::new(File::open(path).map_err(failed)?).map_err(failed)?;
+    tracing::info!("{}: decompressing it to a temporary file", path.display());
+    let mut buffer = vec![0; CHUNK_READ_SIZE];
+    loop {
+        let count = match input.read(&mut buffer) {
+            Ok(0) => return Ok(()),
+            Ok(count) => count,
+            Err(error) => {
+                tracing::warn!("{}: damaged or cut short: {error}", path.display());
+                return Ok(());
+            }
+        };
+        output.write_all(&buffer[..count]).map_err(failed)?;
+    }
+}
+
+/// The start of a file, as much as is needed to guess its format.
+pub(super) fn first_bytes(path: &Path) -> Result<Vec<u8>, LogError> {
+    let failed = |source| LogError::Io { path: path.to_path_buf(), source };
+    let mut start = Vec::new();
+    let file = File::open(path).map_err(failed)?;
+    file.take(FIRST_BYTES).read_to_end(&mut start).map_err(failed)?;
+    Ok(start)
 }
 
 pub(super) fn invalid(what: String) -> io::Error {

@@ -43,6 +43,11 @@ impl TextTable {
         Ok(None)
     }
 
+    /// Number of the last line.
+    pub fn line_number(&self) -> usize {
+        self.number
+    }
+
     /// The error that the last line is wrong.
     pub fn wrong_line(&self, reason: &str) -> LogError {
         corrupt(&self.path, self.number, reason)

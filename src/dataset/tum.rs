@@ -109,7 +109,7 @@ fn available(folder: &Path) -> String {
 }
 
 /// A line `stamp rest` of a list.
-struct Line<'a> {
+pub(super) struct Line<'a> {
     line: &'a str,
     dialect: Dialect,
     unit: TimeUnit,
@@ -137,7 +137,7 @@ impl<'a> Line<'a> {
 }
 
 /// Reads the lines of a list; those that cannot be read are noted with their number.
-fn read_list(
+pub(super) fn read_list(
     folder: &Path,
     name: &str,
     listing: &mut Listing,
@@ -167,7 +167,7 @@ fn read_list(
 }
 
 /// The image that a list names, perhaps as another system would, or where it lay elsewhere.
-fn image_path(folder: &Path, name: &str) -> Result<PathBuf, Rejection> {
+pub(super) fn image_path(folder: &Path, name: &str) -> Result<PathBuf, Rejection> {
     if name.is_empty() {
         return Err(Rejection::new("no file name", name));
     }

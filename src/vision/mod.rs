@@ -11,6 +11,7 @@ mod orb;
 pub mod patch;
 mod pyramid;
 pub mod ransac;
+mod registration;
 #[cfg(feature = "vision")]
 mod select;
 mod stereo;
@@ -23,4 +24,5 @@ pub use orb::{OrbExtractor, VisionError};
 pub use patch::{Patch, PatchConfig};
 pub use pyramid::{Glimpse, Pyramid};
 pub use ransac::{Correspondence, RansacConfig, agree_near, agreeing, estimate_pose};
+pub use registration::DepthRegistration;
 pub use stereo::{StereoError, StereoRig, rectified_camera};

@@ -16,13 +16,15 @@ use serde::Serialize;
 use self::images::{ColorStatistics, DepthStatistics};
 use self::inertial::Inertial;
 use self::timing::Times;
+use super::decode::Decoder;
 use super::folder::{Listing, read_entry};
+use super::inertial_halves::ImuUniter;
 use super::merge::Reading;
 use super::message::{Fields, MessageType};
 use super::open::{Contents, MessageLog};
 use super::pair::{Paired, Pairer};
 use super::pixels::Rejection;
-use super::ros::{Message, Role, Survey, decode, encoding_and_size};
+use super::ros::{ImageHead, ImuContent, Message, Role, Survey};
 use super::{LogConfig, LogError, LogSummary, ReadReport};
 use crate::inertial::ImuConfig;
 use crate::sensor::{ColorImage, Stamp};
@@ -112,6 +114,8 @@ struct Inspector {
     roles: BTreeMap<String, Role>,
     /// Settings that leave the values as they are logged.
     raw: LogConfig,
+    decoder: Decoder,
+    uniter: ImuUniter,
     color: ColorStatistics,
     depth: DepthStatistics,
     inertial: Inertial,
@@ -130,6 +134,8 @@ impl Inspector {
         Self {
             topics: BTreeMap::new(),
             roles: BTreeMap::new(),
+            decoder: Decoder::new(&raw, &ImuConfig::default(), ImuContent::Whole),
+            uniter: ImuUniter::new(&ImuConfig::default()),
             raw,
             color: ColorStatistics::default(),
             depth: DepthStatistics::default(),
@@ -155,6 +161,7 @@ impl Inspector {
             self.stereo = survey.rig(path, &chosen, config)?;
         }
         let summary = survey.summary_of(log.kind(), &chosen, self.stereo.as_ref());
+        self.decoder = survey.decoder(&chosen, &self.raw, &ImuConfig::default());
         self.roles = chosen.into_iter().map(|(role, topic)| (topic, role)).collect();
         let mut messages = log.messages();
         // Topics without messages are told too.
@@ -179,9 +186,9 @@ impl Inspector {
         topic.bytes += message.data.len() as u64;
         times.add(stamp, Some(message.log_time));
         if topic.encoding.is_none()
-            && let Ok((encoding, size)) = encoding_and_size(message)
+            && let Ok(Some(image)) = ImageHead::of(message)
         {
-            (topic.encoding, topic.size) = (encoding, size);
+            (topic.encoding, topic.size) = (Some(image.encoding), image.size);
         }
         let (Some(role), Some(stamp)) = (role, stamp) else { return };
         let number = topic.messages;
@@ -190,8 +197,9 @@ impl Inspector {
             return;
         }
         let is_metres = topic_is_metres(self.topics.get(&channel.topic));
-        match decode(role, message, &self.raw, &ImuConfig::default()) {
-            Ok(reading) => self.take(reading, is_metres),
+        match self.decoder.decode(role, message) {
+            Ok(Some(reading)) => self.take(reading, is_metres, report),
+            Ok(None) => {}
             Err(Rejection { reason, detail }) => report.skip(
                 &format!("{}: {reason}", role.name()),
                 format_args!("{}, {}: {detail}", channel.topic, message.place),
@@ -220,7 +228,9 @@ impl Inspector {
                     if let Some((topic, _)) = self.topics.get_mut(role.name()) {
                         topic.size = reading.image_size().or(topic.size);
                     }
-                    self.take(reading, false);
+                    let mut report = std::mem::take(&mut self.report);
+                    self.take(reading, false, &mut report);
+                    self.report = report;
                 }
                 Err(Rejection { reason, detail }) => {
                     self.report.skip(&format!("{}: {reason}", role.name()), detail);
@@ -229,7 +239,15 @@ impl Inspector {
         }
     }
 
-    fn take(&mut self, reading: Reading, is_metres: bool) {
+    fn take(&mut self, reading: Reading, is_metres: bool, report: &mut ReadReport) {
+        let mut whole = Vec::new();
+        self.uniter.add(reading, &mut whole, report);
+        for reading in whole {
+            self.take_whole(reading, is_metres);
+        }
+    }
+
+    fn take_whole(&mut self, reading: Reading, is_metres: bool) {
         match reading {
             Reading::Color(stamp, image) => {
                 self.color.add(&image);
@@ -246,6 +264,10 @@ impl Inspector {
             Reading::Depth(_, image) => self.depth.add(&image, is_metres),
             Reading::Imu(sample) => self.inertial.add_sample(sample),
             Reading::Truth(pose) => self.inertial.add_truth(pose),
+            Reading::Gyroscope(..)
+            | Reading::Accelerometer(..)
+            | Reading::Gnss(_)
+            | Reading::Magnetic(_) => {}
         }
     }
 
@@ -255,7 +277,7 @@ impl Inspector {
         match role {
             Role::Color => self.pairing.add_color(stamp, ()),
             Role::Depth | Role::Right => self.pairing.add_depth(stamp, stamp),
-            Role::Imu | Role::Truth => return,
+            _ => return,
         };
         self.latest_image = self.latest_image.max(Some(stamp));
         if let Some(latest) = self.latest_image {
@@ -278,6 +300,12 @@ impl Inspector {
 
     fn finish(mut self, summary: LogSummary, assumed: &Assumed) -> Inspection {
         self.settle(Stamp::from_nanos(i64::MAX));
+        let (mut rest, mut report) = (Vec::new(), std::mem::take(&mut self.report));
+        self.uniter.finish(&mut rest, &mut report);
+        self.report = report;
+        for reading in rest {
+            self.take_whole(reading, false);
+        }
         let topics: BTreeMap<String, TopicInspection> = self
             .topics
             .into_iter()
