@@ -106,6 +106,7 @@ fn propagation(c: &mut Criterion) {
         seconds: 0.005,
         angular_velocity: Vector3::new(0.1, -0.2, 0.3),
         specific_force: Some(Vector3::new(0.3, -0.2, 9.8)),
+        angle_covariance: Matrix3::zeros(),
     };
     for kind in [FilterKind::Mfgr, FilterKind::Mekfr] {
         c.bench_function(&format!("imu-step/{kind}"), |b| {

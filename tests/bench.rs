@@ -77,7 +77,8 @@ fn a_report_has_the_keys_of_the_contract_and_is_the_same_twice() {
 fn a_killed_bench_goes_on_where_it_was() {
     let folder = tempfile::tempdir().unwrap();
     let cache = folder.path();
-    let arguments = ["bench", "sim", "--sequences", "lab-simple", "--duration", "2", "--seeds", "2"];
+    let arguments =
+        ["bench", "sim", "--sequences", "lab-simple", "--duration", "2", "--seeds", "2"];
     let mut child = Command::new(env!("CARGO_BIN_EXE_mfg-vio"))
         .args(arguments)
         .args(["--json", "--cache", text(cache)])
@@ -99,7 +100,10 @@ fn a_killed_bench_goes_on_where_it_was() {
     let [first] = &finished()[..] else { panic!("one run was to be finished: {:?}", finished()) };
     let before = std::fs::metadata(first).unwrap().modified().unwrap();
     let report = bench(cache, &arguments[1..]);
-    assert_eq!((&report["rows"][0]["seeds"], &report["rows"][0]["failures"]), (&2.into(), &0.into()));
+    assert_eq!(
+        (&report["rows"][0]["seeds"], &report["rows"][0]["failures"]),
+        (&2.into(), &0.into())
+    );
     assert_eq!(std::fs::metadata(first).unwrap().modified().unwrap(), before, "run again");
     assert_eq!(finished().len(), 2);
 }
@@ -110,8 +114,12 @@ fn a_sweep_has_a_row_for_each_value_and_a_plot() {
     let out = folder.path().join("out");
     let sweep = ["--sweep", "imu.gyro_noise=1e-3,1e-2", "--out", text(&out)];
     let report = bench(folder.path(), &[&SHORT[..], &sweep].concat());
-    let values: Vec<_> =
-        report["rows"].as_array().unwrap().iter().map(|r| &r["settings"]["imu.gyro_noise"]).collect();
+    let values: Vec<_> = report["rows"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|r| &r["settings"]["imu.gyro_noise"])
+        .collect();
     assert_eq!(values, ["1e-3", "1e-2"]);
     let nees = |k: usize| number(&report["rows"][k], &["nees", "attitude"]);
     assert!(nees(1) < nees(0), "ten times the noise makes no filter bolder");
@@ -123,7 +131,8 @@ fn the_guard_passes_what_it_stored_and_refuses_what_is_worse() {
     let folder = tempfile::tempdir().unwrap();
     let (cache, file) = (folder.path().join("cache"), folder.path().join("figures.json"));
     let run = |more: &[&str]| {
-        let short = ["bench", "sim", "--sequences", "lab-simple", "--duration", "2", "--seeds", "2"];
+        let short =
+            ["bench", "sim", "--sequences", "lab-simple", "--duration", "2", "--seeds", "2"];
         mfg_vio(&[&short[..], &["--cache", text(&cache)], more].concat())
     };
     assert!(run(&["--write-guard", text(&file)]).status.success());
@@ -160,7 +169,10 @@ fn wrong_usage_is_told_before_anything_runs() {
     let message = fail(&["bench", "tum-vi", text(empty.path())]);
     assert!(message.contains("dataset-room1_512_16") && message.contains("datasets/tum-vi.md"));
     let plan = succeed(&["bench", "sim", "--sequences", "hall", "--dry-run"]);
-    assert_eq!(plan.lines().collect::<Vec<_>>(), ["hall, mfgs, seed 1", "hall, mfgs, seed 2", "hall, mfgs, seed 3"]);
+    assert_eq!(
+        plan.lines().collect::<Vec<_>>(),
+        ["hall, mfgs, seed 1", "hall, mfgs, seed 2", "hall, mfgs, seed 3"]
+    );
 }
 
 const SIZE: [usize; 2] = [320, 240];
@@ -190,19 +202,30 @@ fn euroc_with_late_truth() {
 #[test]
 fn vcu_rvi_with_its_clocks_and_worlds() {
     let root = tempfile::tempdir().unwrap();
-    let scene = format!("duration = 6.0\nstart_time = 5645.18\n{SMALL}[motion]\nkind = \"lab-motion\"\n[imu]\nrate = 100.0\n");
+    let scene = format!(
+        "duration = 6.0\nstart_time = 5645.18\n{SMALL}[motion]\nkind = \"lab-motion\"\n[imu]\nrate = 100.0\n"
+    );
     // The configuration's camera, at half of its size.
-    let camera = layouts::camera_section(&layouts::simulated_mount(), [229.6785, 229.882, 166.0975, 129.249]);
+    let camera = layouts::camera_section(
+        &layouts::simulated_mount(),
+        [229.6785, 229.882, 166.0975, 129.249],
+    );
     let recording = layouts::render(&format!("{scene}{camera}"));
     layouts::vcu_rvi(root.path(), "lab_motion1", &recording, 0.14, [2.0, 3.0]);
     let halved = [
-        "--set", "camera.fx=229.6785", "--set", "camera.fy=229.882", "--set", "camera.cx=166.0975",
-        "--set", "camera.cy=129.249", "--seeds", "1",
+        "--set",
+        "camera.fx=229.6785",
+        "--set",
+        "camera.fy=229.882",
+        "--set",
+        "camera.cx=166.0975",
+        "--set",
+        "camera.cy=129.249",
+        "--seeds",
+        "1",
     ];
-    let report = bench(
-        &root.path().join("cache"),
-        &[&["vcu-rvi", text(root.path())], &halved[..]].concat(),
-    );
+    let report =
+        bench(&root.path().join("cache"), &[&["vcu-rvi", text(root.path())], &halved[..]].concat());
     let row = row(&report, "lab_motion1");
     assert_eq!(row["published"]["DUI-VIO"], 0.287);
     assert!(number(row, &["coverage"]) > 0.95, "{row:#}");

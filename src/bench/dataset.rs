@@ -178,19 +178,19 @@ impl Dataset {
                  scripts.",
             ],
             Self::TumRgbd => &["There is no gyroscope: a constant-velocity model takes its place."],
-            Self::SevenScenes => &[
-                "There are no stamps (30 Hz are assumed) and no IMU; truth is KinectFusion's.",
-            ],
+            Self::SevenScenes => {
+                &["There are no stamps (30 Hz are assumed) and no IMU; truth is KinectFusion's."]
+            }
             Self::Openloris => &["The wheeled robot starts at rest more often than not."],
-            Self::Broad => &[
-                "Attitude error over the movement phase after taking out the mean heading error.",
-            ],
-            Self::KittiImuGps => &[
-                "Errors are those at fixes withheld for 30 s, from 60 s on again every 100 s.",
-            ],
-            Self::Sim => &[
-                "Each seed has a room, noise and biases of its own, and truth is exact.",
-            ],
+            Self::Broad => {
+                &["Attitude error over the movement phase after taking out the mean heading error."]
+            }
+            Self::KittiImuGps => {
+                &["Errors are those at fixes withheld for 30 s, from 60 s on again every 100 s."]
+            }
+            Self::Sim => {
+                &["Each seed has a room, noise and biases of its own, and truth is exact."]
+            }
         }
     }
 }
@@ -227,25 +227,99 @@ const EUROC: [&str; 11] = [
 ];
 
 const TUM_VI: [&str; 28] = [
-    "room1", "room2", "room3", "room4", "room5", "room6", "corridor1", "corridor2", "corridor3",
-    "corridor4", "corridor5", "magistrale1", "magistrale2", "magistrale3", "magistrale4",
-    "magistrale5", "magistrale6", "outdoors1", "outdoors2", "outdoors3", "outdoors4", "outdoors5",
-    "outdoors6", "outdoors7", "outdoors8", "slides1", "slides2", "slides3",
+    "room1",
+    "room2",
+    "room3",
+    "room4",
+    "room5",
+    "room6",
+    "corridor1",
+    "corridor2",
+    "corridor3",
+    "corridor4",
+    "corridor5",
+    "magistrale1",
+    "magistrale2",
+    "magistrale3",
+    "magistrale4",
+    "magistrale5",
+    "magistrale6",
+    "outdoors1",
+    "outdoors2",
+    "outdoors3",
+    "outdoors4",
+    "outdoors5",
+    "outdoors6",
+    "outdoors7",
+    "outdoors8",
+    "slides1",
+    "slides2",
+    "slides3",
 ];
 
 const VCU_RVI: [&str; 39] = [
-    "lab_simple1", "lab_simple2", "lab_simple3", "lab_motion1", "lab_motion2", "lab_motion3",
-    "lab_motion4", "lab_motion5", "lab_motion6", "lab_light1", "lab_light2", "lab_light3",
-    "lab_light4", "lab_light5", "lab_light6", "lab_dynamic1", "lab_dynamic2", "lab_dynamic3",
-    "lab_dynamic4", "lab_dynamic5", "lab_manual1", "lab_manual2", "lab_manual3", "lab_bumper1",
-    "lab_bumper2", "lab_bumper3", "lab_bumper4", "lab_bumper5", "corridor1", "corridor2",
-    "corridor3", "corridor4", "corridor_manual1", "corridor_manual2", "corridor_bumper1",
-    "corridor_bumper2", "hall1", "hall2", "hall3",
+    "lab_simple1",
+    "lab_simple2",
+    "lab_simple3",
+    "lab_motion1",
+    "lab_motion2",
+    "lab_motion3",
+    "lab_motion4",
+    "lab_motion5",
+    "lab_motion6",
+    "lab_light1",
+    "lab_light2",
+    "lab_light3",
+    "lab_light4",
+    "lab_light5",
+    "lab_light6",
+    "lab_dynamic1",
+    "lab_dynamic2",
+    "lab_dynamic3",
+    "lab_dynamic4",
+    "lab_dynamic5",
+    "lab_manual1",
+    "lab_manual2",
+    "lab_manual3",
+    "lab_bumper1",
+    "lab_bumper2",
+    "lab_bumper3",
+    "lab_bumper4",
+    "lab_bumper5",
+    "corridor1",
+    "corridor2",
+    "corridor3",
+    "corridor4",
+    "corridor_manual1",
+    "corridor_manual2",
+    "corridor_bumper1",
+    "corridor_bumper2",
+    "hall1",
+    "hall2",
+    "hall3",
 ];
 
 const OPENLORIS: [&str; 22] = [
-    "cafe1-1", "cafe1-2", "corridor1-1", "corridor1-2", "corridor1-3", "corridor1-4",
-    "corridor1-5", "home1-1", "home1-2", "home1-3", "home1-4", "home1-5", "market1-1",
-    "market1-2", "market1-3", "office1-1", "office1-2", "office1-3", "office1-4", "office1-5",
-    "office1-6", "office1-7",
+    "cafe1-1",
+    "cafe1-2",
+    "corridor1-1",
+    "corridor1-2",
+    "corridor1-3",
+    "corridor1-4",
+    "corridor1-5",
+    "home1-1",
+    "home1-2",
+    "home1-3",
+    "home1-4",
+    "home1-5",
+    "market1-1",
+    "market1-2",
+    "market1-3",
+    "office1-1",
+    "office1-2",
+    "office1-3",
+    "office1-4",
+    "office1-5",
+    "office1-6",
+    "office1-7",
 ];

@@ -220,15 +220,18 @@ fn truth_file(dataset: Dataset, name: &str, log: &Path, files: &[PathBuf]) -> Op
         ["csv", "txt", "tum"].contains(&ending.as_str())
     };
     let own = stem(log);
-    files.iter().filter(is_table).find(|path| {
-        let stem = stem(path);
-        let bare = ["_groundtruth", "_ground_truth", "_truth", "_gt", "-gt"]
-            .iter()
-            .find_map(|ending| stem.strip_suffix(ending))
-            .unwrap_or(&stem);
-        plain(bare) == plain(&own) || same_sequence(dataset, name, bare)
-    })
-    .cloned()
+    files
+        .iter()
+        .filter(is_table)
+        .find(|path| {
+            let stem = stem(path);
+            let bare = ["_groundtruth", "_ground_truth", "_truth", "_gt", "-gt"]
+                .iter()
+                .find_map(|ending| stem.strip_suffix(ending))
+                .unwrap_or(&stem);
+            plain(bare) == plain(&own) || same_sequence(dataset, name, bare)
+        })
+        .cloned()
 }
 
 /// What a recording needs beyond the configuration of its layout.
@@ -379,17 +382,17 @@ mod tests {
                 &["dataset-room1_512_16/mav0/mocap0/data.csv", "dataset-room10_x/mav0/a"],
                 &["room1", "dataset-room10_x"],
             ),
-            (Dataset::Openloris, &["office1-1/color.txt", "office1-1/sensors.yaml"], &["office1-1"]),
+            (
+                Dataset::Openloris,
+                &["office1-1/color.txt", "office1-1/sensors.yaml"],
+                &["office1-1"],
+            ),
             (
                 Dataset::TumRgbd,
                 &["rgbd_dataset_freiburg2_desk/rgb.txt"],
                 &["rgbd_dataset_freiburg2_desk"],
             ),
-            (
-                Dataset::SevenScenes,
-                &["chess/seq-01/frame-000000.color.png"],
-                &["chess-seq-01"],
-            ),
+            (Dataset::SevenScenes, &["chess/seq-01/frame-000000.color.png"], &["chess-seq-01"]),
             (Dataset::Broad, &["01_slow/imu.csv", "01_slow/reference.csv"], &["01_slow"]),
             (
                 Dataset::KittiImuGps,

@@ -17,7 +17,9 @@ pub enum BenchError {
     NoRoot { dataset: &'static str },
     #[error("no sequence `{name}` in {dataset}; there are: {available}")]
     UnknownSequence { dataset: &'static str, name: String, available: String },
-    #[error("{dataset}: `{name}` is absent under {root} (datasets/{dataset}.md says where to get it)")]
+    #[error(
+        "{dataset}: `{name}` is absent under {root} (datasets/{dataset}.md says where to get it)"
+    )]
     Absent { dataset: &'static str, name: String, root: PathBuf },
     #[error("unknown filter `{name}`; {dataset} takes: {available}")]
     UnknownFilter { dataset: &'static str, name: String, available: String },
@@ -41,7 +43,9 @@ pub enum BenchError {
     Write(#[from] WriteError),
     #[error(transparent)]
     Plot(#[from] PlotError),
-    #[error("interrupted; {finished} of {planned} runs are kept, the same command goes on from there")]
+    #[error(
+        "interrupted; {finished} of {planned} runs are kept, the same command goes on from there"
+    )]
     Interrupted { finished: usize, planned: usize },
 }
 

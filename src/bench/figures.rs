@@ -92,8 +92,7 @@ pub fn rows(dataset: Dataset, runs: &[(PlannedRun, RunRecord)]) -> Vec<Row> {
 fn row(dataset: Dataset, runs: &[(PlannedRun, RunRecord)]) -> Option<Row> {
     let (first, _) = runs.first()?;
     let outcomes = || runs.iter().map(|(_, record)| &record.outcome);
-    let spread =
-        |value: &dyn Fn(&Outcome) -> Option<f64>| Spread::of(outcomes().filter_map(value));
+    let spread = |value: &dyn Fn(&Outcome) -> Option<f64>| Spread::of(outcomes().filter_map(value));
     let nees = |value: &dyn Fn(&NeesMeans) -> Option<f64>| {
         mean(outcomes().filter_map(|outcome| value(outcome.nees.as_ref()?)))
     };

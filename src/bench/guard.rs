@@ -209,14 +209,11 @@ fn differences(name: &str, pairs: &[(&StoredRow, &StoredRow)], level: f64) -> Ve
             false => after > before,
         };
         let bound = if after > before { before + allowed } else { before - allowed };
-        ((after - before).abs() > allowed).then(|| Finding {
-            worse,
-            ..row.finding(name, before.exp(), after.exp(), bound.exp())
-        })
+        ((after - before).abs() > allowed)
+            .then(|| Finding { worse, ..row.finding(name, before.exp(), after.exp(), bound.exp()) })
     };
-    let inverse = |before: &[f64], after: &[f64]| {
-        1.0 / before.len() as f64 + 1.0 / after.len() as f64
-    };
+    let inverse =
+        |before: &[f64], after: &[f64]| 1.0 / before.len() as f64 + 1.0 / after.len() as f64;
     let mut findings: Vec<Finding> = logarithms
         .iter()
         .filter_map(|(row, before, after)| {
@@ -227,10 +224,10 @@ fn differences(name: &str, pairs: &[(&StoredRow, &StoredRow)], level: f64) -> Ve
         mean(&logarithms.iter().map(side).collect::<Vec<_>>())
     };
     let count = logarithms.len() as f64;
-    let variance =
-        logarithms.iter().map(|(_, b, a)| inverse(b, a)).sum::<f64>() / (count * count);
+    let variance = logarithms.iter().map(|(_, b, a)| inverse(b, a)).sum::<f64>() / (count * count);
     let all = StoredRow { sequence: "all".to_owned(), ..StoredRow::default() };
-    let (before, after) = (means(|(_, before, _)| mean(before)), means(|(_, _, after)| mean(after)));
+    let (before, after) =
+        (means(|(_, before, _)| mean(before)), means(|(_, _, after)| mean(after)));
     findings.extend(told(&all, before, after, variance));
     findings
 }
@@ -256,8 +253,7 @@ fn losses(pairs: &[(&StoredRow, &StoredRow)], level: f64) -> Vec<Finding> {
 /// Runs that fail and faults that are missed which were not.
 fn failures(stored: &StoredRow, found: &StoredRow) -> Vec<Finding> {
     let count = |name: &str, before: usize, after: usize| {
-        (after > before)
-            .then(|| stored.finding(name, before as f64, after as f64, before as f64))
+        (after > before).then(|| stored.finding(name, before as f64, after as f64, before as f64))
     };
     let missed = found.faults_missed.iter().filter(|f| !stored.faults_missed.contains(f)).count();
     let failed = count("failures", stored.failures, found.failures);

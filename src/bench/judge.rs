@@ -69,8 +69,7 @@ pub fn judge(
     };
     let stamps = truth.stamps().iter().map(|stamp| stamp - clock_offset.unwrap_or(0.0)).collect();
     let truth = Trajectory::new(stamps, truth.poses().to_vec())?;
-    let evaluation =
-        evaluate(&truth, estimate, &estimated.covariances, judging.levelled)?.summary;
+    let evaluation = evaluate(&truth, estimate, &estimated.covariances, judging.levelled)?.summary;
     let ape_m = match clock_offset {
         None => evaluation.ape_translation.rmse,
         // As published figures have it: positions at the offset that suits them best.
@@ -265,8 +264,12 @@ mod tests {
         let stamps = every(0.05, 1.0, 60.0);
         let exact = trajectory(&stamps, &world);
         let sds = [0.002, 0.01, 0.02];
-        let mut draw =
-            |sd: f64| Vector3::from_fn(|_, _| { let x: f64 = StandardNormal.sample(&mut rng); sd * x });
+        let mut draw = |sd: f64| {
+            Vector3::from_fn(|_, _| {
+                let x: f64 = StandardNormal.sample(&mut rng);
+                sd * x
+            })
+        };
         let mut poses = Vec::new();
         let mut velocities = Vec::new();
         for (k, (t, pose)) in stamps.iter().zip(exact.poses()).enumerate() {
@@ -290,8 +293,7 @@ mod tests {
             velocities,
         };
         let truth = trajectory(&every(1.0 / 120.0, 0.0, 61.0), &Isometry3::identity());
-        let judging =
-            Judging { clock: Clock::Shared, levelled: true, exact: true, span: None };
+        let judging = Judging { clock: Clock::Shared, levelled: true, exact: true, span: None };
         let judged = judge(&truth, &estimated, &judging).unwrap();
         let nees = judged.nees.unwrap();
         for mean in [nees.attitude, nees.position, nees.velocity] {

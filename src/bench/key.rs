@@ -105,12 +105,7 @@ pub(super) fn input_digest(sequence: &Sequence) -> Result<String, BenchError> {
 /// Folders in folders of a log that count.
 const FOLDERS: usize = 4;
 
-fn add_files(
-    root: &Path,
-    path: &Path,
-    depth: usize,
-    hash: &mut Sha256,
-) -> Result<(), BenchError> {
+fn add_files(root: &Path, path: &Path, depth: usize, hash: &mut Sha256) -> Result<(), BenchError> {
     let io = |source| BenchError::Io { path: path.to_owned(), source };
     let metadata = std::fs::metadata(path).map_err(io)?;
     if metadata.is_dir() {

@@ -34,7 +34,7 @@ pub use judge::{Estimated, Judged, Judging, coverage, judge};
 pub use key::{RunKey, program_fingerprint};
 pub use plan::{Axis, BenchRequest, Plan, PlannedRun, plan};
 pub use published::{Published, published};
-pub use recipe::{Recipe, RECIPES, Sensors};
+pub use recipe::{RECIPES, Recipe, Sensors};
 pub use record::{Outcome, RunRecord, Store, Times};
 pub use report::{BenchReport, report, sweep_figure};
 pub use run::{Progress, Workshop, execute};

@@ -228,7 +228,11 @@ fn filters(request: &BenchRequest) -> Result<Vec<String>, BenchError> {
     Ok(filters)
 }
 
-fn settings(request: &BenchRequest, sequence: &Sequence, swept: &[(String, String)]) -> Vec<String> {
+fn settings(
+    request: &BenchRequest,
+    sequence: &Sequence,
+    swept: &[(String, String)],
+) -> Vec<String> {
     let swept = swept.iter().map(|(key, value)| format!("{key}={value}"));
     sequence.settings.iter().chain(&request.settings).cloned().chain(swept).collect()
 }
@@ -285,15 +289,10 @@ fn not_there(request: &BenchRequest, name: &str, found: &[Sequence]) -> BenchErr
 }
 
 /// The recipes, or the motions along the trajectories under `root`.
-fn simulated(
-    root: Option<&PathBuf>,
-    request: &BenchRequest,
-) -> Result<Vec<Sequence>, BenchError> {
+fn simulated(root: Option<&PathBuf>, request: &BenchRequest) -> Result<Vec<Sequence>, BenchError> {
     let Some(root) = root else {
         let named = |name: &str| request.sequences.iter().any(|wanted| wanted == name);
-        let wanted = |recipe: &&super::Recipe| {
-            !request.quick || recipe.quick || named(recipe.name)
-        };
+        let wanted = |recipe: &&super::Recipe| !request.quick || recipe.quick || named(recipe.name);
         let sequence = |recipe: &super::Recipe| Sequence {
             name: recipe.name.to_owned(),
             source: Source::Recipe { recipe: *recipe, trajectory: None },
@@ -326,7 +325,8 @@ fn simulated(
             disturbed: Vec::new(),
         })
     };
-    let found: Vec<Sequence> = files.into_iter().filter(|f| f.is_file()).filter_map(along).collect();
+    let found: Vec<Sequence> =
+        files.into_iter().filter(|f| f.is_file()).filter_map(along).collect();
     let (dataset, expected) = (request.dataset.name(), "trajectories (TUM format) to move along");
     match found.is_empty() {
         true => Err(BenchError::NothingFound { dataset, root: root.clone(), expected }),
@@ -367,7 +367,8 @@ mod tests {
 
     #[test]
     fn a_grid_has_every_combination() {
-        let sweep = vec!["imu.gyro_noise=1,2".parse().unwrap(), "map.max_points=3,4,5".parse().unwrap()];
+        let sweep =
+            vec!["imu.gyro_noise=1,2".parse().unwrap(), "map.max_points=3,4,5".parse().unwrap()];
         assert_eq!(grid(&sweep).len(), 6);
         let request = BenchRequest {
             sequences: vec!["hall".to_owned()],

@@ -33,9 +33,7 @@ pub fn published(dataset: Dataset) -> &'static [Published] {
 
 /// The figures on one sequence by estimator.
 pub fn of_sequence(dataset: Dataset, sequence: &str) -> BTreeMap<String, f64> {
-    let figure = |row: &Published| {
-        Some((row.estimator.to_owned(), row.figure(dataset, sequence)?))
-    };
+    let figure = |row: &Published| Some((row.estimator.to_owned(), row.figure(dataset, sequence)?));
     published(dataset).iter().filter_map(figure).collect()
 }
 
@@ -49,48 +47,102 @@ const EUROC_STEREO: [Published; 6] = [
         estimator: "OKVIS2",
         source: "Leutenegger, arXiv 2202.09199, table I, VIO (position and yaw alignment)",
         figures: &[
-            s(0.057), s(0.044), s(0.082), s(0.189), s(0.141), s(0.043), s(0.037), s(0.036),
-            s(0.044), s(0.044), s(0.063),
+            s(0.057),
+            s(0.044),
+            s(0.082),
+            s(0.189),
+            s(0.141),
+            s(0.043),
+            s(0.037),
+            s(0.036),
+            s(0.044),
+            s(0.044),
+            s(0.063),
         ],
     },
     Published {
         estimator: "Basalt",
         source: "Usenko et al., Visual-Inertial Mapping with Non-Linear Factor Recovery, RA-L 2020",
         figures: &[
-            s(0.07), s(0.06), s(0.07), s(0.13), s(0.11), s(0.04), s(0.05), s(0.10), s(0.04),
-            s(0.05), N,
+            s(0.07),
+            s(0.06),
+            s(0.07),
+            s(0.13),
+            s(0.11),
+            s(0.04),
+            s(0.05),
+            s(0.10),
+            s(0.04),
+            s(0.05),
+            N,
         ],
     },
     Published {
         estimator: "OpenVINS",
         source: "stereo, quoted by others; the primary table was not checked",
         figures: &[
-            s(0.091), s(0.124), s(0.138), s(0.166), s(0.243), s(0.055), s(0.057), s(0.060),
-            s(0.059), s(0.045), s(0.103),
+            s(0.091),
+            s(0.124),
+            s(0.138),
+            s(0.166),
+            s(0.243),
+            s(0.055),
+            s(0.057),
+            s(0.060),
+            s(0.059),
+            s(0.045),
+            s(0.103),
         ],
     },
     Published {
         estimator: "VINS-Fusion",
         source: "stereo, quoted by others; the primary table was not checked",
         figures: &[
-            s(0.166), s(0.152), s(0.125), s(0.280), s(0.284), s(0.076), s(0.069), s(0.114),
-            s(0.066), s(0.091), s(0.096),
+            s(0.166),
+            s(0.152),
+            s(0.125),
+            s(0.280),
+            s(0.284),
+            s(0.076),
+            s(0.069),
+            s(0.114),
+            s(0.066),
+            s(0.091),
+            s(0.096),
         ],
     },
     Published {
         estimator: "OKVIS2 (loops)",
         source: "Leutenegger, arXiv 2202.09199, table I, causal, with loop closure",
         figures: &[
-            s(0.044), s(0.036), s(0.050), s(0.089), s(0.112), s(0.037), s(0.021), s(0.035),
-            s(0.036), s(0.024), s(0.045),
+            s(0.044),
+            s(0.036),
+            s(0.050),
+            s(0.089),
+            s(0.112),
+            s(0.037),
+            s(0.021),
+            s(0.035),
+            s(0.036),
+            s(0.024),
+            s(0.045),
         ],
     },
     Published {
         estimator: "ORB-SLAM3 (loops)",
         source: "Campos et al., arXiv 2007.11898, table II, median of 10, with loop closure",
         figures: &[
-            s(0.036), s(0.033), s(0.035), s(0.051), s(0.082), s(0.038), s(0.014), s(0.024),
-            s(0.032), s(0.014), s(0.024),
+            s(0.036),
+            s(0.033),
+            s(0.035),
+            s(0.051),
+            s(0.082),
+            s(0.038),
+            s(0.014),
+            s(0.024),
+            s(0.032),
+            s(0.014),
+            s(0.024),
         ],
     },
 ];
@@ -100,32 +152,68 @@ const EUROC_MONO: [Published; 4] = [
         estimator: "DM-VIO",
         source: "von Stumberg and Cremers, DM-VIO: Delayed Marginalization Visual-Inertial Odometry, RA-L 2022",
         figures: &[
-            N, s(0.044), s(0.097), s(0.102), s(0.096), s(0.048), s(0.045), s(0.069), s(0.029),
-            s(0.050), s(0.114),
+            N,
+            s(0.044),
+            s(0.097),
+            s(0.102),
+            s(0.096),
+            s(0.048),
+            s(0.045),
+            s(0.069),
+            s(0.029),
+            s(0.050),
+            s(0.114),
         ],
     },
     Published {
         estimator: "XRSLAM SF-VIO",
         source: "XRSLAM, docs/en/benchmark.md",
         figures: &[
-            s(0.109), s(0.147), s(0.131), s(0.189), s(0.240), s(0.056), s(0.101), s(0.134),
-            s(0.066), s(0.089), s(0.122),
+            s(0.109),
+            s(0.147),
+            s(0.131),
+            s(0.189),
+            s(0.240),
+            s(0.056),
+            s(0.101),
+            s(0.134),
+            s(0.066),
+            s(0.089),
+            s(0.122),
         ],
     },
     Published {
         estimator: "OpenVINS",
         source: "mono, as given in XRSLAM, docs/en/benchmark.md",
         figures: &[
-            s(0.111), s(0.287), s(0.181), s(0.182), s(0.365), s(0.059), s(0.084), s(0.075),
-            s(0.086), s(0.074), s(0.145),
+            s(0.111),
+            s(0.287),
+            s(0.181),
+            s(0.182),
+            s(0.365),
+            s(0.059),
+            s(0.084),
+            s(0.075),
+            s(0.086),
+            s(0.074),
+            s(0.145),
         ],
     },
     Published {
         estimator: "VINS-Fusion",
         source: "mono, as given in XRSLAM, docs/en/benchmark.md",
         figures: &[
-            s(0.149), s(0.110), s(0.168), s(0.221), s(0.310), s(0.071), s(0.282), s(0.170),
-            s(0.166), s(0.386), s(0.190),
+            s(0.149),
+            s(0.110),
+            s(0.168),
+            s(0.221),
+            s(0.310),
+            s(0.071),
+            s(0.282),
+            s(0.170),
+            s(0.166),
+            s(0.386),
+            s(0.190),
         ],
     },
 ];
@@ -168,42 +256,132 @@ const VCU_RVI: [Published; 3] = [
         estimator: "DUI-VIO",
         source: VCU_SOURCE,
         figures: &[
-            s(0.085), s(0.065), s(0.048), // simple
-            s(0.287), s(0.377), s(0.218), s(0.351), s(0.226), s(0.273), // motion
-            N, N, s(0.236), s(0.118), s(0.612), s(1.03), // light
-            s(0.185), s(0.134), s(0.272), N, s(0.128), // dynamic
-            s(0.112), s(0.152), s(0.074), // manual
-            N, s(0.310), N, N, s(0.183), // bumper
-            s(1.74), s(1.45), s(2.28), s(1.11), // corridor
-            N, N, N, N, s(1.37), s(1.64), // corridor manual, bumper; hall
+            s(0.085),
+            s(0.065),
+            s(0.048), // simple
+            s(0.287),
+            s(0.377),
+            s(0.218),
+            s(0.351),
+            s(0.226),
+            s(0.273), // motion
+            N,
+            N,
+            s(0.236),
+            s(0.118),
+            s(0.612),
+            s(1.03), // light
+            s(0.185),
+            s(0.134),
+            s(0.272),
+            N,
+            s(0.128), // dynamic
+            s(0.112),
+            s(0.152),
+            s(0.074), // manual
+            N,
+            s(0.310),
+            N,
+            N,
+            s(0.183), // bumper
+            s(1.74),
+            s(1.45),
+            s(2.28),
+            s(1.11), // corridor
+            N,
+            N,
+            N,
+            N,
+            s(1.37),
+            s(1.64), // corridor manual, bumper; hall
         ],
     },
     Published {
         estimator: "VINS-RGBD",
         source: VCU_SOURCE,
         figures: &[
-            s(0.097), s(0.064), s(0.052), // simple
-            s(0.310), s(0.407), s(0.192), s(0.320), s(0.270), s(0.289), // motion
-            N, s(0.238), N, s(0.086), s(0.681), N, // light
-            s(0.166), s(0.191), s(0.302), N, s(0.137), // dynamic
-            s(0.514), s(0.169), N, // manual
-            N, N, N, N, N, // bumper
-            s(2.25), s(0.85), s(3.23), s(0.98), // corridor
-            N, N, N, N, s(1.46), s(3.93), // corridor manual, bumper; hall
+            s(0.097),
+            s(0.064),
+            s(0.052), // simple
+            s(0.310),
+            s(0.407),
+            s(0.192),
+            s(0.320),
+            s(0.270),
+            s(0.289), // motion
+            N,
+            s(0.238),
+            N,
+            s(0.086),
+            s(0.681),
+            N, // light
+            s(0.166),
+            s(0.191),
+            s(0.302),
+            N,
+            s(0.137), // dynamic
+            s(0.514),
+            s(0.169),
+            N, // manual
+            N,
+            N,
+            N,
+            N,
+            N, // bumper
+            s(2.25),
+            s(0.85),
+            s(3.23),
+            s(0.98), // corridor
+            N,
+            N,
+            N,
+            N,
+            s(1.46),
+            s(3.93), // corridor manual, bumper; hall
         ],
     },
     Published {
         estimator: "VINS-Mono",
         source: VCU_SOURCE,
         figures: &[
-            s(0.090), s(0.079), s(0.095), // simple
-            s(0.253), s(0.428), s(0.222), s(0.363), s(0.237), s(0.275), // motion
-            N, s(0.274), s(0.241), s(0.142), N, s(0.750), // light
-            s(0.207), s(0.363), s(0.402), N, s(0.361), // dynamic
-            N, s(0.248), s(0.401), // manual
-            N, s(0.387), N, N, N, // bumper
-            s(2.05), s(0.77), s(1.86), s(2.15), // corridor
-            N, N, N, N, s(2.41), s(6.26), // corridor manual, bumper; hall
+            s(0.090),
+            s(0.079),
+            s(0.095), // simple
+            s(0.253),
+            s(0.428),
+            s(0.222),
+            s(0.363),
+            s(0.237),
+            s(0.275), // motion
+            N,
+            s(0.274),
+            s(0.241),
+            s(0.142),
+            N,
+            s(0.750), // light
+            s(0.207),
+            s(0.363),
+            s(0.402),
+            N,
+            s(0.361), // dynamic
+            N,
+            s(0.248),
+            s(0.401), // manual
+            N,
+            s(0.387),
+            N,
+            N,
+            N, // bumper
+            s(2.05),
+            s(0.77),
+            s(1.86),
+            s(2.15), // corridor
+            N,
+            N,
+            N,
+            N,
+            s(2.41),
+            s(6.26), // corridor manual, bumper; hall
         ],
     },
 ];
@@ -276,8 +454,7 @@ mod tests {
                     .seconds;
                 let options = ApeOptions::default();
                 let offset = best_clock_offset(&reference, &estimate, offset, &options).unwrap();
-                let association =
-                    AssociationOptions { time_offset: offset, ..options.association };
+                let association = AssociationOptions { time_offset: offset, ..options.association };
                 let options = ApeOptions { association, ..options };
                 let error = ape(&reference, &estimate, &options).unwrap().statistics.rmse;
                 let (limit, digit) = match name.starts_with("lab") {

@@ -106,7 +106,10 @@ impl Store {
         std::fs::write(&part, text + "\n").map_err(io)?;
         std::fs::rename(&part, &path).map_err(io)?;
         let kept = self.get(&record.key)?;
-        kept.ok_or_else(|| BenchError::Format { path, reason: "is not what was written".to_owned() })
+        kept.ok_or_else(|| BenchError::Format {
+            path,
+            reason: "is not what was written".to_owned(),
+        })
     }
 }
 
@@ -148,7 +151,8 @@ mod tests {
     fn a_damaged_record_is_made_again() {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).unwrap();
-        let record = RunRecord { key: key(1), outcome: Outcome::default(), times: Times::default() };
+        let record =
+            RunRecord { key: key(1), outcome: Outcome::default(), times: Times::default() };
         store.put(&record).unwrap();
         let path = store.file(&key(1)).unwrap();
         std::fs::write(&path, "{\"key\":").unwrap();

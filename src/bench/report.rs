@@ -64,7 +64,9 @@ impl BenchReport {
         let rows = self.rows.iter().map(|row| {
             let mut cells = vec![row.sequence.clone(), row.filter.clone()];
             cells.extend(with_init.then(|| row.init.clone().unwrap_or_else(|| "-".to_owned())));
-            cells.extend(swept.iter().map(|key| row.settings.get(*key).cloned().unwrap_or_default()));
+            cells.extend(
+                swept.iter().map(|key| row.settings.get(*key).cloned().unwrap_or_default()),
+            );
             cells.extend(figures(row));
             cells.into_iter().map(Cell::Text).collect()
         });
@@ -123,7 +125,8 @@ impl BenchReport {
     pub fn to_text(&self) -> String {
         let mut text = self.table().to_text();
         if let Some(comparison) = self.comparison() {
-            text += &format!("\nposition RMSE, m, beside published figures\n{}", comparison.to_text());
+            text +=
+                &format!("\nposition RMSE, m, beside published figures\n{}", comparison.to_text());
             let sources = self.sources.iter().map(|(name, source)| format!("{name}: {source}\n"));
             text.extend(sources);
         }
@@ -254,7 +257,8 @@ fn panel(
         }
     }
     let spans = |numbers: &Vec<f64>| {
-        let (min, max) = numbers.iter().fold((f64::MAX, 0.0_f64), |(a, b), x| (a.min(*x), b.max(*x)));
+        let (min, max) =
+            numbers.iter().fold((f64::MAX, 0.0_f64), |(a, b), x| (a.min(*x), b.max(*x)));
         min > 0.0 && max >= 10.0 * min
     };
     let logarithmic = numbers.as_ref().is_some_and(spans);

@@ -174,8 +174,7 @@ fn make(
             let Some(scene) = &job.scene else { return Ok(None) };
             let frames = run.duration.map(|s| (s * scene.frame_rate()) as u64);
             progress.begin(&format!("rendering for {label}"), done, planned, frames);
-            let rendered =
-                scene.render(workshop.cache, workshop.stop, &mut || progress.frame())?;
+            let rendered = scene.render(workshop.cache, workshop.stop, &mut || progress.frame())?;
             let std::ops::ControlFlow::Continue(log) = rendered else { return Ok(None) };
             let part = Part { run, plan, log: &log, truth: None, faults: &job.key.faults };
             part.replay(workshop, progress, (done, planned))
@@ -189,8 +188,7 @@ fn make(
         }
         Source::Navigation { imu, gps } => {
             progress.begin(&label, done, planned, None);
-            let outcome =
-                tables::navigation(imu, gps, &run.filter, &run.settings, workshop.stop);
+            let outcome = tables::navigation(imu, gps, &run.filter, &run.settings, workshop.stop);
             outcome.map(|outcome| (outcome, None))
         }
     };
@@ -238,8 +236,8 @@ impl Part<'_> {
         let filter = self.run.filter.parse::<FilterKind>();
         let filter =
             filter.map_err(|reason| BenchError::Format { path: self.log.to_owned(), reason })?;
-        let seeks = config.search.seek_state_points
-            && filter.map_treatment() == MapTreatment::Correlated;
+        let seeks =
+            config.search.seek_state_points && filter.map_treatment() == MapTreatment::Correlated;
         let front_end = OrbExtractor::new(&config.features, &config.camera, &config.depth);
         let mut front_end = front_end
             .map_err(|error| BenchError::Format {

@@ -115,13 +115,11 @@ impl CameraFolder {
         let grey: Vec<u8> = image.data().chunks(3).map(|pixel| pixel[1]).collect();
         let mut png = Vec::new();
         PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub)
-            .write_image(
-                &grey,
-                image.width() as u32,
-                image.height() as u32,
-                ExtendedColorType::L8,
-            )
-            .map_err(|error| BenchError::Format { path: path.clone(), reason: error.to_string() })?;
+            .write_image(&grey, image.width() as u32, image.height() as u32, ExtendedColorType::L8)
+            .map_err(|error| BenchError::Format {
+                path: path.clone(),
+                reason: error.to_string(),
+            })?;
         save(&path, &png)?;
         self.rows += &format!("{stamp},{name}\n");
         Ok(())

@@ -11,7 +11,7 @@ use super::figures::NeesMeans;
 use super::record::Outcome;
 use crate::dataset::{read_imu_table, read_position_table};
 use crate::evaluation::NeesSummary;
-use crate::filter::attitude::{AdaptiveConfig, AttitudeFilterKind};
+use crate::filter::attitude::AttitudeFilterKind;
 use crate::filter::gnss::{GnssConfig, GnssFilterKind, OutageConfig, navigate};
 use crate::replay::{AttitudeRequest, replay_attitude};
 
@@ -24,13 +24,15 @@ pub(super) fn attitude(
     work: &Path,
     stop: &AtomicBool,
 ) -> Result<Outcome, BenchError> {
-    let filter: AttitudeFilterKind = filter.parse().map_err(|reason: String| {
-        BenchError::Format { path: imu.to_owned(), reason }
-    })?;
+    let filter: AttitudeFilterKind = filter
+        .parse()
+        .map_err(|reason: String| BenchError::Format { path: imu.to_owned(), reason })?;
     let request = AttitudeRequest {
         log: imu.to_owned(),
         filter,
-        config: AdaptiveConfig::default(),
+        config: None,
+        overrides: Vec::new(),
+        topic: None,
         out: Some(work.to_owned()),
         stop,
     };
@@ -129,12 +131,11 @@ pub(super) fn navigation(
     })?;
     let config = GnssConfig { outage: OUTAGE, ..GnssConfig::shipped(settings)? };
     let (samples, fixes) = (read_imu_table(imu)?, read_position_table(gps)?);
-    let summary = navigate(kind, &config, &samples, &fixes, |_| {
-        match stop.load(Ordering::Relaxed) {
+    let summary =
+        navigate(kind, &config, &samples, &fixes, |_| match stop.load(Ordering::Relaxed) {
             true => ControlFlow::Break(()),
             false => ControlFlow::Continue(()),
-        }
-    });
+        });
     let summary = match summary {
         Ok(summary) => summary,
         Err(error) => {

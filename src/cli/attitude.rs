@@ -92,7 +92,7 @@ fn summary(m: &AttitudeMetrics) -> Vec<String> {
         ));
     }
     if let Some(last) = &m.last {
-        let Reached { time, quaternion, rotation_sd_deg, gyro_bias, s } = last;
+        let Reached { time, quaternion, rotation_sd_deg, gyro_bias, s, .. } = last;
         lines.push(format!("at {time:.3} s: quaternion (x y z w) {quaternion:.6?}"));
         lines.push(format!("  standard deviation {rotation_sd_deg:.3?} deg"));
         lines.push(format!("  gyro bias {gyro_bias:.6?} rad/s, s {s:.1?}"));

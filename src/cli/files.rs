@@ -1,7 +1,7 @@
 //! Which arguments name files that are read and which ones that are written: the one place that
 //! sees to it that no output harms an input, for every command alike.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::{Arg, ArgMatches, Command};
 use mfg_vio::output::{Files, resolved};

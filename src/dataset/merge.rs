@@ -6,9 +6,7 @@ use nalgebra::Vector3;
 
 use super::pair::{Paired, Pairer};
 use super::{Event, Log, LogConfig, LogSummary, ReadReport, RgbdFrame, TruthPose};
-use crate::sensor::{
-    ColorImage, DepthImage, GnssFix, ImuSample, MagneticSample, Stamp, Stream,
-};
+use crate::sensor::{ColorImage, DepthImage, GnssFix, ImuSample, MagneticSample, Stamp, Stream};
 
 /// One message of a stream that is used, decoded.
 #[derive(Debug, Clone, PartialEq)]

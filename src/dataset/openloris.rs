@@ -47,19 +47,19 @@ pub(super) fn list(folder: &Path, config: &LogConfig) -> Result<(LogSummary, Lis
     }
     let transforms = Transforms::read(folder)?;
     let mut listing = Listing::default();
-    read_list(folder, COLOR_LIST, &mut listing, |stamp, text| {
-        image_path(folder, text).map(|path| (stamp, Entry::Color(path)))
+    read_list(folder, COLOR_LIST, &mut listing, |line, stamp| {
+        image_path(folder, line.rest()).map(|path| vec![(stamp, Entry::Color(path))])
     })?;
-    read_list(folder, DEPTH_LIST, &mut listing, |stamp, text| {
-        image_path(folder, text).map(|path| (stamp, Entry::Depth(path)))
+    read_list(folder, DEPTH_LIST, &mut listing, |line, stamp| {
+        image_path(folder, line.rest()).map(|path| vec![(stamp, Entry::Depth(path))])
     })?;
     let has_imu = config.imu_topic != "none" && has(GYROSCOPE) && has(ACCELEROMETER);
     if has_imu {
-        read_list(folder, GYROSCOPE, &mut listing, |stamp, text| {
-            vector(text).map(|rate| (stamp, Entry::Gyroscope(rate)))
+        read_list(folder, GYROSCOPE, &mut listing, |line, stamp| {
+            vector(line.rest()).map(|rate| vec![(stamp, Entry::Gyroscope(rate))])
         })?;
-        read_list(folder, ACCELEROMETER, &mut listing, |stamp, text| {
-            vector(text).map(|force| (stamp, Entry::Accelerometer(force)))
+        read_list(folder, ACCELEROMETER, &mut listing, |line, stamp| {
+            vector(line.rest()).map(|force| vec![(stamp, Entry::Accelerometer(force))])
         })?;
     }
     let body_frame = if has_imu { IMU_FRAME } else { COLOR_FRAME };
@@ -67,8 +67,8 @@ pub(super) fn list(folder: &Path, config: &LogConfig) -> Result<(LogSummary, Lis
         && config.truth_topic != "none"
         && has(TRUTH_LIST)
     {
-        read_list(folder, TRUTH_LIST, &mut listing, |stamp, text| {
-            pose(stamp, text, &base_from_body).map(|pose| (stamp, Entry::Truth(pose)))
+        read_list(folder, TRUTH_LIST, &mut listing, |line, stamp| {
+            pose(stamp, line.rest(), &base_from_body).map(|pose| vec![(stamp, Entry::Truth(pose))])
         })?;
     }
     let camera = camera(folder, &transforms)?;

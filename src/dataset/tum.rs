@@ -121,7 +121,7 @@ impl<'a> Line<'a> {
     }
 
     /// All behind the stamp: a file's name may hold blanks.
-    fn rest(&self) -> &'a str {
+    pub fn rest(&self) -> &'a str {
         let split = match self.dialect.separator {
             Separator::Blanks => self.line.split_once(char::is_whitespace),
             Separator::Commas => self.line.split_once(','),

@@ -291,7 +291,8 @@ mod tests {
     fn positions_move_an_offset_to_the_least_error() {
         let reference = trajectory(100.0, 30.0, 0.0, 0.0);
         let estimate = trajectory(20.0, 20.0, -0.1, 5.0);
-        let options = ApeOptions { alignment: crate::evaluation::Alignment::None, ..Default::default() };
+        let options =
+            ApeOptions { alignment: crate::evaluation::Alignment::None, ..Default::default() };
         for start in [0.0, 0.1, 0.25] {
             let found = best_clock_offset(&reference, &estimate, start, &options).unwrap();
             assert!((found - 0.1).abs() <= POSITION_FINE, "{found}");

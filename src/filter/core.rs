@@ -95,12 +95,7 @@ pub struct InertialStep {
 impl InertialStep {
     /// An interval of which only the angular velocity is known.
     pub fn turning(angular_velocity: Vector3<f64>, seconds: f64) -> Self {
-        Self {
-            seconds,
-            angular_velocity,
-            specific_force: None,
-            angle_covariance: Matrix3::zeros(),
-        }
+        Self { seconds, angular_velocity, specific_force: None, angle_covariance: Matrix3::zeros() }
     }
 
     /// The same interval with an angle that is known less well.
@@ -114,12 +109,13 @@ impl InertialStep {
             seconds: to.stamp.seconds_since(from.stamp),
             angular_velocity: (from.angular_velocity + to.angular_velocity) * 0.5,
             specific_force: Some((from.specific_force + to.specific_force) * 0.5),
+            angle_covariance: Matrix3::zeros(),
         }
     }
 
     /// An interval in which nothing was measured, for models of motion that need no IMU.
     pub fn unmeasured(seconds: f64) -> Self {
-        Self { seconds, angular_velocity: Vector3::zeros(), specific_force: None }
+        Self::turning(Vector3::zeros(), seconds)
     }
 
     /// Refuses an interval that is not positive, and readings that are not finite.

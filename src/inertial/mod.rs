@@ -13,8 +13,8 @@ mod state;
 pub use clipping::{Clipped, ClippingMonitor};
 pub use coverage::Coverage;
 pub use directions::{
-    BodyDirection, DirectionConfig, DirectionFinder, Directions, GravityConfig, MagneticConfig, Prediction,
-    RestConfig,
+    BodyDirection, DirectionConfig, DirectionFinder, Directions, GravityConfig, MagneticConfig,
+    Prediction, RestConfig,
 };
 pub use imu::ImuConfig;
 pub use initial::{InitialAttitude, StandstillCheck, StandstillConfig, attitude_from_gravity};

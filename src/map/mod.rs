@@ -234,6 +234,7 @@ fn direction(from: &Vector3<f64>, to: &Vector3<f64>) -> Option<Vector3<f64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::vision::Descriptor;
     use nalgebra::UnitQuaternion;
     use proptest::prelude::*;
 

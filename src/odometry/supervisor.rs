@@ -63,10 +63,8 @@ impl Supervisor {
     }
 
     /// What comes now is by other clocks: nothing that was usual counts any more.
-    pub fn begin_anew(&mut self, imu: &ImuConfig) {
-        self.sensors = SensorWatch::new(imu);
-        self.clock = ClockWatch::default();
-        self.gyroscope = GyroscopeWatch::default();
+    pub fn begin_anew(&mut self, faults: &FaultConfig, imu: &ImuConfig) {
+        self.monitors = Monitors::new(faults, imu);
         self.sound = None;
         self.health.new_run();
     }

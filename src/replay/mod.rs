@@ -364,7 +364,7 @@ impl Iterator for EventSource<'_> {
         match &event {
             Event::Truth(pose) if is_new(pose) => self.truth.push(*pose),
             Event::Frame(frame) => self.note_frame(frame.stamp),
-            Event::Truth(_) | Event::Imu(_) => {}
+            Event::Truth(_) | Event::Imu(_) | Event::Repeated(..) => {}
         }
         Some(event)
     }

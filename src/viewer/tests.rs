@@ -15,7 +15,7 @@ use rerun::log::{Chunk, LogMsg};
 use super::*;
 use crate::inertial::{NavCovariance, NavState, block};
 use crate::odometry::{
-    KeypointRole, KeypointView, MapPointView, Note, NoteLevel, StageTimes, StepCounts, StepReport,
+    KeypointRole, KeypointView, MapPointView, Note, StageTimes, StepCounts, StepReport,
 };
 use crate::sensor::{
     ColorImage, DepthImage, ImuSample, PinholeCamera, PixelFormat, RgbdFrame, Stamp,

@@ -29,6 +29,7 @@ pub fn render(scene: &str) -> Recording {
         match event {
             Event::Frame(frame) => recording.frames.push(*frame),
             Event::Imu(sample) => recording.imu.push(sample),
+            Event::Repeated(..) => {}
             Event::Truth(pose) => recording.truth.push(pose),
         }
     }
@@ -124,7 +125,11 @@ pub fn euroc_pose(pose: &TruthPose) -> String {
 }
 
 /// A camera's `sensor.yaml`.
-pub fn sensor_yaml(imu_from_camera: &Isometry3<f64>, size: [usize; 2], intrinsics: [f64; 4]) -> String {
+pub fn sensor_yaml(
+    imu_from_camera: &Isometry3<f64>,
+    size: [usize; 2],
+    intrinsics: [f64; 4],
+) -> String {
     let matrix = imu_from_camera.to_homogeneous();
     let rows: Vec<String> = matrix.transpose().iter().map(|x| format!("{x:.12}")).collect();
     format!(
@@ -139,7 +144,13 @@ pub fn sensor_yaml(imu_from_camera: &Isometry3<f64>, size: [usize; 2], intrinsic
 /// A VCU-RVI bag with its truth: images called `8UC3` in BGR, the accelerometer in -g, log times of
 /// another clock; truth in an x-up world that begins with the identity, by a clock `ahead` seconds
 /// ahead, without the span `gap` (s after the start).
-pub fn vcu_rvi(root: &Path, name: &str, recording: &Recording, ahead: f64, gap: [f64; 2]) -> PathBuf {
+pub fn vcu_rvi(
+    root: &Path,
+    name: &str,
+    recording: &Recording,
+    ahead: f64,
+    gap: [f64; 2],
+) -> PathBuf {
     const LOG_TIME: f64 = 1.55e9;
     let mut messages = Vec::new();
     for frame in &recording.frames {
@@ -258,7 +269,10 @@ pub fn tum_rgbd(root: &Path, recording: &Recording, imu_from_camera: &Isometry3<
         }
     }
     for (folder, list) in lists {
-        save(&root.join(format!("{folder}.txt")), format!("# images\n# file\n# timestamp filename\n{list}"));
+        save(
+            &root.join(format!("{folder}.txt")),
+            format!("# images\n# file\n# timestamp filename\n{list}"),
+        );
     }
     let poses = recording.truth.iter().map(|pose| {
         tum_line(pose.stamp.seconds(), &(world * pose.world_from_body * imu_from_camera))
@@ -272,9 +286,10 @@ pub fn seven_scenes(root: &Path, recording: &Recording, imu_from_camera: &Isomet
         let stem = root.join(format!("frame-{k:06}"));
         save_color(&stem.with_extension("color.png"), frame);
         save_depth(&stem.with_extension("depth.png"), &frame.depth, 1000.0, 65535);
-        let nearest = recording.truth.iter().min_by_key(|pose| {
-            (pose.stamp.nanos() - frame.stamp.nanos()).abs()
-        });
+        let nearest = recording
+            .truth
+            .iter()
+            .min_by_key(|pose| (pose.stamp.nanos() - frame.stamp.nanos()).abs());
         let pose = nearest.unwrap().world_from_body * imu_from_camera;
         let matrix = pose.to_homogeneous();
         let row = |r: usize| (0..4).map(|c| format!("{:e}", matrix[(r, c)])).collect::<Vec<_>>();
@@ -301,7 +316,8 @@ pub fn forward_mount(right: f64) -> Isometry3<f64> {
 /// The `[camera]` section of a scene.
 pub fn camera_section(mount: &Isometry3<f64>, [fx, fy, cx, cy]: [f64; 4]) -> String {
     let matrix = mount.to_homogeneous();
-    let row = |r: usize| (0..4).map(|c| format!("{:.12}", matrix[(r, c)])).collect::<Vec<_>>().join(", ");
+    let row =
+        |r: usize| (0..4).map(|c| format!("{:.12}", matrix[(r, c)])).collect::<Vec<_>>().join(", ");
     let rows: Vec<String> = (0..4).map(|r| format!("[{}]", row(r))).collect();
     format!(
         "[camera]\nfx = {fx:?}\nfy = {fy:?}\ncx = {cx:?}\ncy = {cy:?}\nimu_from_camera = [{}]\n",
@@ -311,9 +327,15 @@ pub fn camera_section(mount: &Isometry3<f64>, [fx, fy, cx, cy]: [f64; 4]) -> Str
 
 /// An OpenLORIS-Scene package: gyroscope and accelerometer at two rates, truth of the robot's base
 /// in a planar world of its own.
-pub fn openloris(root: &Path, recording: &Recording, imu_from_camera: &Isometry3<f64>, intrinsics: [f64; 4]) {
+pub fn openloris(
+    root: &Path,
+    recording: &Recording,
+    imu_from_camera: &Isometry3<f64>,
+    intrinsics: [f64; 4],
+) {
     let world = Isometry3::new(Vector3::new(21.4, 21.1, 0.0), Vector3::z() * -0.6);
-    let base_from_imu = Isometry3::new(Vector3::new(0.23, -0.05, 0.9), Vector3::new(0.1, 1.4, -0.3));
+    let base_from_imu =
+        Isometry3::new(Vector3::new(0.23, -0.05, 0.9), Vector3::new(0.1, 1.4, -0.3));
     let mut lists = [("color", String::new()), ("aligned_depth", String::new())];
     for frame in &recording.frames {
         let seconds = frame.stamp.seconds();
@@ -367,7 +389,9 @@ pub fn openloris(root: &Path, recording: &Recording, imu_from_camera: &Isometry3
     let item = |parent: &str, child: &str, pose: &Isometry3<f64>| {
         let rows: Vec<f64> = pose.to_homogeneous().transpose().iter().copied().collect();
         let matrix = matrix(4, 4, &rows);
-        format!("   -\n      parent_frame: {parent}\n      child_frame: {child}\n      matrix: {matrix}")
+        format!(
+            "   -\n      parent_frame: {parent}\n      child_frame: {child}\n      matrix: {matrix}"
+        )
     };
     let color = "d400_color_optical_frame";
     let imu = imu_from_camera.inverse();

@@ -28,5 +28,6 @@ pub fn step() -> InertialStep {
         seconds: 0.01,
         angular_velocity: Vector3::new(0.1, -0.05, 0.3),
         specific_force: Some(Vector3::new(0.5, 1.0, 9.8)),
+        angle_covariance: nalgebra::Matrix3::zeros(),
     }
 }

@@ -127,6 +127,7 @@ pub fn recording() -> &'static Recording {
             match event {
                 Event::Frame(frame) => frames.push(*frame),
                 Event::Imu(sample) => imu.push(sample),
+                Event::Repeated(..) => {}
                 Event::Truth(_) => {}
             }
         }

@@ -2,9 +2,7 @@
 
 use std::num::NonZeroUsize;
 
-use mfg_vio::evaluation::{
-    self, Alignment, ApeOptions, AssociationOptions, EvaluationError, Relation, Table, Trajectory,
-};
+use mfg_vio::evaluation::{self, Alignment, ApeOptions, Relation, Table, Trajectory};
 
 use super::arguments::AlignArg;
 use super::estimates::{Compared, EstimateReport, Kind};

@@ -4,9 +4,7 @@ use std::num::NonZeroUsize;
 
 use anyhow::bail;
 use clap::ValueEnum;
-use mfg_vio::evaluation::{
-    self, AssociationOptions, Delta, EvaluationError, Relation, RpeOptions, Table, Trajectory,
-};
+use mfg_vio::evaluation::{self, Delta, Relation, RpeOptions, Table, Trajectory};
 
 use super::super::WrongUsage;
 use super::arguments::{AlignArg, positive};

@@ -463,6 +463,7 @@ mod tests {
     use nalgebra::Rotation3;
 
     use super::*;
+    use crate::sensor::Stamp;
     use crate::so3::{exp, log};
 
     const WITH_BIAS: [AttitudeFilterKind; 7] = [

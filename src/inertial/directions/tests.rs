@@ -15,10 +15,6 @@ fn turning(t: f64) -> Rotation3<f64> {
     )
 }
 
-fn lying(_: f64) -> Rotation3<f64> {
-    Rotation3::from_euler_angles(0.3, -0.5, 1.0)
-}
-
 fn still(_: f64) -> Vector3<f64> {
     Vector3::zeros()
 }
