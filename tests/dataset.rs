@@ -189,6 +189,7 @@ fn make_stereo_folder(folder: &Path) -> PathBuf {
                 let t = s.stamp.nanos();
                 imu += &format!("{t},{},{},{},{},{},{}\n", w.x, w.y, w.z, a.x, a.y, a.z);
             }
+            Event::Repeated(..) => {}
             Event::Truth(pose) => {
                 let (p, q) = (pose.world_from_body.translation, pose.world_from_body.rotation);
                 let t = pose.stamp.nanos();
