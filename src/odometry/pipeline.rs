@@ -16,7 +16,7 @@ use super::restart::{Legacy, Spread};
 use super::run::Run;
 use super::supervisor::{FrameEvidence, Supervisor};
 use super::truth::TruthTrack;
-use super::window::ImuCursor;
+use super::window::{ImuCursor, ImuWindow};
 use crate::fault::{Divergence, Episode};
 use crate::filter::{Calibration, FilterKind, KnownAttitude};
 use crate::inertial::{Belief, Propagator};
@@ -61,6 +61,15 @@ pub struct OdometryStats {
     /// Why it was not, when it was not.
     pub waiting_reason: Option<String>,
     pub health: HealthSummary,
+}
+
+impl OdometryStats {
+    /// Counts a frame and the IMU data before it.
+    fn count(&mut self, seen: &FrameEvidence, window: &ImuWindow) {
+        self.frames_processed += 1;
+        self.frames_without_update += u64::from(seen.update.is_none() && seen.expected);
+        self.imu_gaps += window.gaps.len() as u64;
+    }
 }
 
 impl Odometry {
@@ -228,18 +237,15 @@ impl Odometry {
         run.refine_tracks(&mut tracks, front, &mut view, &prediction);
 
         let update = run.update(&tracks, &view);
-        let visible = detected.with_depth >= config.search.min_matches;
-        let expected = std::mem::replace(&mut run.expects_matches, true);
-        stats.frames_without_update += u64::from(update.is_none() && expected);
-        let features = detected.features;
         let seen = FrameEvidence {
             stamp: time,
-            expected,
-            visible,
-            features,
+            expected: std::mem::replace(&mut run.expects_matches, true),
+            visible: detected.with_depth >= config.search.min_matches,
+            features: detected.features,
             tracks: &tracks,
             update: update.as_ref(),
         };
+        stats.count(&seen, &window);
         run.watch(&seen, &view, supervisor, config);
         laps.lap(|times| &mut times.update);
 
@@ -252,8 +258,6 @@ impl Odometry {
             buffer.imu = supervisor.retime(offset).collect();
         }
 
-        stats.imu_gaps += window.gaps.len() as u64;
-        stats.frames_processed += 1;
         let notes = supervisor.take_notes();
         let mut report = run.report(front, &tracks, update.as_ref(), &assignments, notes);
         (report.frame, report.times) = (number, laps.times);

@@ -25,7 +25,7 @@ pub use outputs::{RESULTS, state_columns};
 pub use report::{Series, figures, report};
 
 use crate::config::Config;
-use crate::dataset::{self, Fault, Log, ReadReport};
+use crate::dataset::{self, Fault, Log, LogSummary, ReadReport};
 use crate::evaluation::{Similarity, Trajectory, is_vertical, read_trajectory};
 use crate::filter::FilterKind;
 use crate::inertial::pose_covariance;
@@ -124,17 +124,7 @@ pub fn replay(
             .ok_or(ReplayError::Extrinsics)?;
     let map_every = observers.iter().map(|observer| observer.map_every()).filter(|n| *n > 0).min();
     odometry.report_map_every(map_every.unwrap_or(0));
-    let mut session = Session {
-        outputs: request.out.as_deref().map(Outputs::create).transpose()?,
-        failure: None,
-        series: Series::default(),
-        notes: Vec::new(),
-        estimate: Vec::new(),
-        covariances: Vec::new(),
-        estimate_from_reference: None,
-        truth_max_gap: config.truth.max_gap,
-        levelled: summary.has_imu,
-    };
+    let mut session = Session::start(request, summary.has_imu)?;
     let mut truth = Vec::new();
     let given = request.truth.as_deref().map(given_truth).transpose()?;
     let options = RunOptions {
@@ -170,9 +160,38 @@ pub fn replay(
     let cpu_seconds = cpu_clock.elapsed().as_secs_f64();
 
     session.finish_outputs(&odometry)?;
+    let times = RunTimes { log_seconds: span.seconds(), wall_seconds, cpu_seconds };
+    let read = log.report().clone();
+    let mut replayed = conclude(request, summary, read, &odometry, session, &truth, times)?;
+    replayed.first_seconds = first.unwrap_or_default().seconds();
+    replayed.frame_span = frame_span.0.map(|(first, last)| [first.seconds(), last.seconds()]);
+    if let Some(directory) = &request.out {
+        write_metrics(directory, &replayed.metrics)?;
+    }
+    Ok(replayed)
+}
+
+/// How long a run took, s.
+struct RunTimes {
+    log_seconds: f64,
+    wall_seconds: f64,
+    cpu_seconds: f64,
+}
+
+/// Evaluates a run that is over and sums it up.
+fn conclude(
+    request: &Request,
+    summary: LogSummary,
+    read: ReadReport,
+    odometry: &Odometry,
+    session: Session,
+    truth: &[TruthPose],
+    times: RunTimes,
+) -> Result<Replayed, ReplayError> {
+    let config = &request.config;
     let stats = odometry.stats();
     let estimate = trajectory(&session.estimate);
-    let reference = trajectory(&shifted(&truth, config.truth.time_offset));
+    let reference = trajectory(&shifted(truth, config.truth.time_offset));
     let Some(estimate) = estimate else {
         let reason = stats.waiting_reason.unwrap_or_else(|| "the log has none".to_owned());
         return Err(ReplayError::NothingProcessed { log: request.log.clone(), reason });
@@ -194,30 +213,27 @@ pub fn replay(
         threads: request.threads,
         sources: summary.sources,
         has_imu: summary.has_imu,
-        read: log.report().clone(),
+        notes: with_skipped(session.notes, &read),
+        read,
         odometry: stats,
         interrupted: request.stop.load(std::sync::atomic::Ordering::Relaxed),
-        log_seconds: span.seconds(),
-        wall_seconds,
-        cpu_seconds,
-        real_time_factor: span.seconds() / wall_seconds.max(1e-9),
+        log_seconds: times.log_seconds,
+        wall_seconds: times.wall_seconds,
+        cpu_seconds: times.cpu_seconds,
+        real_time_factor: times.log_seconds / times.wall_seconds.max(1e-9),
         peak_memory_bytes: peak_memory_bytes(),
         stages: stage_summaries(&session.series.times),
         path_length: path_length(&session.estimate),
         calibration: odometry.calibration().map(Into::into),
         evaluation: evaluated.as_ref().map(|evaluated| evaluated.summary.clone()),
         evaluation_failure,
-        notes: with_skipped(session.notes, log.report()),
     };
-    if let Some(directory) = &request.out {
-        write_metrics(directory, &metrics)?;
-    }
     Ok(Replayed {
         metrics,
         series: session.series,
         evaluated,
-        first_seconds: first.unwrap_or_default().seconds(),
-        frame_span: frame_span.0.map(|(first, last)| [first.seconds(), last.seconds()]),
+        first_seconds: 0.0,
+        frame_span: None,
         reference,
         estimate: session.estimate,
         covariances: session.covariances,
@@ -420,6 +436,20 @@ fn estimate_from_reference(
 }
 
 impl Session {
+    fn start(request: &Request, has_imu: bool) -> Result<Self, ReplayError> {
+        Ok(Self {
+            outputs: request.out.as_deref().map(Outputs::create).transpose()?,
+            failure: None,
+            series: Series::default(),
+            notes: Vec::new(),
+            estimate: Vec::new(),
+            covariances: Vec::new(),
+            estimate_from_reference: None,
+            truth_max_gap: request.config.truth.max_gap,
+            levelled: has_imu,
+        })
+    }
+
     fn step(
         &mut self,
         report: &StepReport,
