@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use statrs::function::erf::erf_inv;
 
-use super::world::{Solid, View, World};
+use super::world::{Hit, Solid, View, World};
 use crate::sensor::{ColorImage, DepthImage, PinholeCamera, PixelFormat};
 use crate::vision::DepthConfig;
 
@@ -132,7 +132,7 @@ impl Scene<'_> {
     #[inline]
     fn trace(&self, column: f32, row: f32, candidates: &[usize]) -> Sample {
         let (x, y) = self.camera.direction(column, row);
-        let mut nearest: Option<(usize, super::world::Hit)> = None;
+        let mut nearest: Option<(usize, Hit)> = None;
         for &index in candidates {
             if nearest.is_some_and(|(_, hit)| hit.distance < self.nearest[index]) {
                 continue;
