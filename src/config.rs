@@ -13,7 +13,7 @@ use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
 use crate::odometry::{HealthConfig, InitConfig, OdometryConfig, TruthConfig};
-use crate::sensor::CameraConfig;
+use crate::sensor::{Camera, CameraConfig, CameraError};
 use crate::tracking::SearchConfig;
 use crate::viewer::RecordingConfig;
 use crate::vision::{
@@ -85,7 +85,8 @@ pub fn shipped_names() -> Vec<&'static str> {
 impl Config {
     /// The configuration that is shipped under `name`, with `overrides` (`section.key=value`).
     pub fn shipped(name: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        parse(shipped_text(name)?, &format!("configs/{name}.toml"), overrides)
+        let origin = format!("configs/{name}.toml");
+        parse::<Self>(shipped_text(name)?, &origin, overrides)?.checked(&origin)
     }
 
     /// The configuration for a log, with `overrides`: that of `file`, or the shipped one for the
@@ -106,14 +107,36 @@ impl Config {
         let given: Self = parse(&text, &origin, overrides)?;
         let told = log.camera.clone().filter(|_| file.is_none() || log.is_stereo());
         let Some(camera) = told.or(given.rectified_camera(log, &origin)?) else {
-            return Ok(given);
+            return given.checked(&origin);
         };
         // Keys that are set by hand count more than what the log tells.
         let without_overrides: Self = parse(&text, &origin, &[])?;
         let text = toml::to_string(&Self { camera, ..without_overrides }).map_err(|error| {
             ConfigError::Syntax { origin: origin.clone(), message: error.to_string() }
         })?;
-        parse(&text, &origin, overrides)
+        parse::<Self>(&text, &origin, overrides)?.checked(&origin)
+    }
+
+    /// Itself if its cameras are possible ones.
+    fn checked(self, origin: &str) -> Result<Self, ConfigError> {
+        let check = |section: &str, camera: &CameraConfig| {
+            camera.validate().map_err(|error| ConfigError::BadValue {
+                origin: origin.to_owned(),
+                key: format!("{section}.{}", error.key()),
+                message: error.to_string(),
+            })
+        };
+        check("camera", &self.camera)?;
+        self.log.stereo.iter().try_for_each(|camera| check("log.stereo", camera))?;
+        Ok(self)
+    }
+
+    /// The camera, with depth as it is measured.
+    ///
+    /// # Errors
+    /// See [`CameraConfig::validate`].
+    pub fn lens(&self) -> Result<Camera, CameraError> {
+        Ok(Camera::new(&self.camera)?.with_depth(self.depth.along))
     }
 
     /// Where depth comes from two image topics.

@@ -12,7 +12,7 @@ use mfg_vio::odometry::{InitMode, StepReport};
 use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
 use mfg_vio::sensor::RgbdFrame;
 #[cfg(feature = "viewer")]
-use mfg_vio::sensor::{ImuSample, PinholeCamera};
+use mfg_vio::sensor::{Camera, ImuSample};
 use mfg_vio::viewer::{Contents, Purpose};
 #[cfg(feature = "viewer")]
 use mfg_vio::viewer::{Recorder, Sink};
@@ -249,7 +249,7 @@ struct Recording {
     #[cfg(feature = "viewer")]
     map_every: u64,
     #[cfg(feature = "viewer")]
-    camera: Option<(PinholeCamera, Isometry3<f64>)>,
+    camera: Option<(Camera, Isometry3<f64>)>,
 }
 
 #[cfg(feature = "viewer")]
@@ -269,7 +269,7 @@ impl Recording {
         Ok(Self {
             recorder,
             map_every: config.recording.map_every,
-            camera: Some(((&config.camera).into(), mounting.unwrap_or_default())),
+            camera: Some((config.lens()?, mounting.unwrap_or_default())),
         })
     }
 

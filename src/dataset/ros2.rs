@@ -4,7 +4,7 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
 use serde::{Serialize, Serializer};
 
 use super::message::MessageType;
-use crate::sensor::{CameraConfig, ColorImage, Stamp};
+use crate::sensor::{CameraConfig, CameraModel, ColorImage, Stamp};
 
 #[derive(Serialize)]
 pub struct Header {
@@ -145,8 +145,8 @@ impl CameraInfo {
             header,
             height: image.height() as u32,
             width: image.width() as u32,
-            distortion_model: "plumb_bob",
-            d: camera.distortion.to_vec(),
+            distortion_model: distortion_model(camera.model),
+            d: camera.distortion.clone(),
             k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
             r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
             p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
@@ -160,6 +160,15 @@ impl CameraInfo {
                 do_rectify: false,
             },
         }
+    }
+}
+
+/// `sensor_msgs/distortion_models`; the models that it lacks by their own names.
+fn distortion_model(model: CameraModel) -> &'static str {
+    match model {
+        CameraModel::RadialTangential => "plumb_bob",
+        CameraModel::Rational => "rational_polynomial",
+        other => other.name(),
     }
 }
 

@@ -64,8 +64,7 @@ pub struct OdometryStats {
 }
 
 impl Odometry {
-    /// `None` if `camera.imu_from_camera` is no rigid
-    /// motion.
+    /// `None` if `camera` is no possible calibration or its mounting no rigid motion.
     pub fn new(
         config: &OdometryConfig,
         kind: FilterKind,
@@ -84,7 +83,7 @@ impl Odometry {
         };
         Some(Self {
             config: config.clone(),
-            tracking: config.tracking(),
+            tracking: config.tracking().ok()?,
             kind,
             seed,
             body_from_camera,

@@ -3,6 +3,7 @@
 use nalgebra::{Isometry3, Matrix3, Vector3};
 
 use super::light::LIGHT_CELL;
+use crate::simulation::lens::Ray;
 use crate::simulation::texture::{Color, Grain, Texture};
 
 /// Width of the lens's and the color filter's blur spot, pixels.
@@ -96,24 +97,15 @@ impl Solid {
     }
 
     #[inline]
-    pub fn hit_in_view(&self, view: &View, x: f32, y: f32, near: f32) -> Option<Hit> {
-        let direction = view.axes * Vector3::new(x, y, 1.0);
+    pub fn hit_in_view(&self, view: &View, ray: &Ray, near: f32) -> Option<Hit> {
+        let direction = view.axes * ray.direction;
         self.hit(&view.origin, &direction, near)
     }
 
-    /// Color of a hit in a view: `x`, `y` are normalized image coordinates, `pixel` the size of a
-    /// pixel in them.
+    /// Color of a hit in a view.
     #[inline]
-    pub fn color(
-        &self,
-        view: &View,
-        hit: Hit,
-        x: f32,
-        y: f32,
-        pixel: [f32; 2],
-        grain: &Grain,
-    ) -> Color {
-        let direction = view.axes * Vector3::new(x, y, 1.0);
+    pub fn color(&self, view: &View, hit: Hit, ray: &Ray, grain: &Grain) -> Color {
+        let direction = view.axes * ray.direction;
         let point = view.origin + direction * hit.distance;
         let (axis, u, v) = face_axes(hit.face);
         // The footprint of a pixel on the face: its edges, carried along the face's plane.
@@ -121,7 +113,7 @@ impl Solid {
         let along = if along.abs() < 1e-6 { 1e-6_f32.copysign(along) } else { along };
         let mut edges = [[0.0; 2]; 2];
         for (side, edge) in edges.iter_mut().enumerate() {
-            let e = view.axes.column(side) * (SPOT * pixel[side] * hit.distance);
+            let e = view.axes * (ray.across[side] * SPOT * hit.distance);
             let slide = e[axis] / along;
             *edge = [e[u] - direction[u] * slide, e[v] - direction[v] * slide];
         }
@@ -138,6 +130,11 @@ impl Solid {
         base.map(|c| c * factor)
     }
 
+    /// Distance of the camera of a view from the box, m; 0 inside.
+    pub fn distance(&self, view: &View) -> f32 {
+        (view.origin.abs() - self.half).map(|beyond| beyond.max(0.0)).norm()
+    }
+
     /// Corners in world coordinates.
     pub fn corners(&self) -> [Vector3<f32>; 8] {
         std::array::from_fn(|i| {
@@ -149,8 +146,8 @@ impl Solid {
     }
 
     /// Cosine between the ray and the normal of the face it hits.
-    pub fn incidence(view: &View, hit: Hit, x: f32, y: f32) -> f32 {
-        let direction = view.axes * Vector3::new(x, y, 1.0);
+    pub fn incidence(view: &View, hit: Hit, ray: &Ray) -> f32 {
+        let direction = view.axes * ray.direction;
         direction[hit.face / 2].abs() / direction.norm()
     }
 }
