@@ -1,5 +1,7 @@
 //! The configuration of a run: one TOML file a sensor set-up, single keys overridden by `--set`.
 
+pub mod import;
+
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -87,6 +89,11 @@ impl Config {
     pub fn shipped(name: &str, overrides: &[String]) -> Result<Self, ConfigError> {
         let origin = format!("configs/{name}.toml");
         parse::<Self>(shipped_text(name)?, &origin, overrides)?.checked(&origin)
+    }
+
+    /// A configuration file's text; keys that it leaves out have their defaults.
+    pub fn from_toml(text: &str) -> Result<Self, ConfigError> {
+        parse::<Self>(text, "configuration", &[])?.checked("configuration")
     }
 
     /// The configuration for a log, with `overrides`: that of `file`, or the shipped one for the
