@@ -1,9 +1,11 @@
+use std::fmt::Write;
 use std::path::PathBuf;
 
 use anyhow::Context;
 use serde_json::json;
 
 use super::terminal::print;
+use mfg_vio::config::Resolved;
 use mfg_vio::config::import::{ImportOptions, ImportedValue, import};
 use mfg_vio::output::{self, Files};
 
@@ -16,7 +18,32 @@ pub struct Args {
 
 #[derive(Debug, clap::Subcommand)]
 enum Command {
+    Show(ShowArgs),
     Import(ImportArgs),
+}
+
+/// Print every setting with which a log would be replayed, and where it is from.
+///
+/// Origins, each counting more than those before: default; shipped file (chosen by the log's layout);
+/// sensor class (noise of the device, by a table); log (CameraInfo, transforms, frames); file
+/// (--config); command line (--set).
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Example:\n  mfg-vio config show lab_bumper1.bag --set imu.gyro_noise=1e-3\n  \
+                        mfg-vio config show lab_bumper1.bag --json | jq '.settings[] | select(.origin == \"log\")'"
+)]
+struct ShowArgs {
+    /// The log: a file or a folder.
+    log: PathBuf,
+    /// Configuration of the sensor set-up; by default chosen by the log's layout.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Override a key of the configuration; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
 }
 
 /// Make a configuration from the calibration of another program.
@@ -51,8 +78,42 @@ fn rate(text: &str) -> Result<f64, String> {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     match &args.command {
+        Command::Show(args) => show(args),
         Command::Import(args) => run_import(args),
     }
+}
+
+fn show(args: &ShowArgs) -> anyhow::Result<()> {
+    let resolved = Resolved::of(&args.log, args.config.as_deref(), &args.overrides)?;
+    let settings = resolved.settings();
+    let problems = &resolved.summary.calibration.problems;
+    if args.json {
+        let object = json!({
+            "log": args.log.display().to_string(),
+            "config": resolved.name(),
+            "device": resolved.summary.calibration.device,
+            "settings": settings,
+            "conflicts": resolved.conflicts,
+            "missing": resolved.missing(),
+            "problems": problems,
+        });
+        return print(&serde_json::to_string_pretty(&object)?);
+    }
+    let mut out = String::new();
+    for setting in settings {
+        let value = setting.value.to_string();
+        writeln!(out, "{:<32} {value:<40} {}", setting.key, setting.origin)?;
+    }
+    for conflict in &resolved.conflicts {
+        writeln!(out, "WARNING  {conflict}")?;
+    }
+    for problem in problems {
+        writeln!(out, "WARNING  {problem}")?;
+    }
+    for key in resolved.missing() {
+        writeln!(out, "MISSING  {key}")?;
+    }
+    print(out.trim_end())
 }
 
 fn run_import(args: &ImportArgs) -> anyhow::Result<()> {

@@ -13,7 +13,7 @@ use opencv::prelude::*;
 
 use super::pyramid::full_pixel;
 use super::select::{Corner, spread};
-use super::{DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Patch, Pyramid};
+use super::{DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Mask, Patch, Pyramid};
 use crate::sensor::{Camera, CameraConfig, CameraError, PixelFormat, RgbdFrame};
 
 /// Radius of the patch that orientation and descriptor are computed from, pixels of the level.
@@ -53,6 +53,11 @@ pub enum VisionError {
         color.0, color.1, depth.0, depth.1
     )]
     SizeMismatch { color: (usize, usize), depth: (usize, usize) },
+    #[error(
+        "the image of log.mask has {}x{} pixels, the color image {}x{}: it must be of that size",
+        mask.0, mask.1, color.0, color.1
+    )]
+    MaskSize { mask: (usize, usize), color: (usize, usize) },
     #[error("features.{key} = {value}: must be {expected}")]
     Config { key: &'static str, value: f64, expected: &'static str },
     #[error("camera.{0}")]
@@ -73,6 +78,7 @@ pub struct OrbExtractor {
     sensitive: Ptr<FastFeatureDetector>,
     orb: Ptr<ORB>,
     keeps_pyramid: bool,
+    mask: Mask,
 }
 
 impl OrbExtractor {
@@ -113,7 +119,13 @@ impl OrbExtractor {
             sensitive: detector(config.min_fast_threshold.min(config.fast_threshold))?,
             orb,
             keeps_pyramid: false,
+            mask: Mask::default(),
         })
+    }
+
+    /// The same, that finds nothing in a part of the image.
+    pub fn masked(self, mask: Mask) -> Self {
+        Self { mask, ..self }
     }
 
     /// The same, that gives the pyramid with the features, to be looked at again.
@@ -128,11 +140,15 @@ impl OrbExtractor {
         if color != depth {
             return Err(VisionError::SizeMismatch { color, depth });
         }
+        if let Some(mask) = self.mask.size().filter(|mask| *mask != color) {
+            return Err(VisionError::MaskSize { mask, color });
+        }
         let pyramid = self.pyramid(frame)?;
         let mut corners = vec![];
         for (level, image) in pyramid.iter().enumerate() {
             self.detect(level as u8, image, color, &mut corners)?;
         }
+        corners.retain(|corner| !self.mask.covers(corner.pixel.x, corner.pixel.y));
         let (cell, spacing) = (self.config.cell_size, self.config.min_spacing);
         let corners = spread(corners, color.0, color.1, cell, spacing, self.config.max_features);
         let described = self.describe(&pyramid, &corners)?;
@@ -145,9 +161,25 @@ impl OrbExtractor {
         let mut pyramid = Pyramid::default();
         for (octave, level) in levels.iter().enumerate() {
             let scale = self.config.scale_factor.powi(octave as i32);
-            pyramid.push(level.data_bytes()?.to_vec(), level.cols() as usize, scale);
+            let (mut pixels, width) = (level.data_bytes()?.to_vec(), level.cols() as usize);
+            self.blank(&mut pixels, width, scale);
+            pyramid.push(pixels, width, scale);
         }
         Ok(pyramid)
+    }
+
+    /// Leaves nothing to be recognised in the masked part of a level.
+    fn blank(&self, pixels: &mut [u8], width: usize, scale: f64) {
+        if self.mask.is_empty() {
+            return;
+        }
+        for (index, pixel) in pixels.iter_mut().enumerate() {
+            let here = Point2::new((index % width) as f64, (index / width) as f64);
+            let full = full_pixel(here, Vector2::repeat(scale));
+            if self.mask.covers(full.x, full.y) {
+                *pixel = 0;
+            }
+        }
     }
 
     /// The grey image and its reductions, as far as a patch fits into them.
@@ -341,7 +373,7 @@ fn orientation(pixels: &[u8], stride: usize, corner: &Corner) -> f32 {
 mod tests {
     use super::*;
     use crate::sensor::{ColorImage, DepthImage, Stamp};
-    use crate::vision::{MatchingConfig, match_descriptors};
+    use crate::vision::{MaskConfig, MatchingConfig, match_descriptors};
     use opencv::calib3d;
     use opencv::core::{Point2d, TermCriteria, TermCriteria_Type};
     use rand::{Rng, SeedableRng};
@@ -394,6 +426,25 @@ mod tests {
             assert!((0.0..HEIGHT as f64).contains(&f.pixel.y));
             assert!((f.depth.unwrap().depth - 2.0).abs() < 1e-9);
         }
+    }
+
+    #[test]
+    fn nothing_is_found_in_the_masked_part() {
+        let image = frame(WIDTH, HEIGHT, collage(1));
+        let regions = MaskConfig::Regions(vec![[0, 160, 320, 80], [100, 0, 60, 240]]);
+        let mask = regions.load().unwrap();
+        let covered = |f: &&Feature| mask.covers(f.pixel.x, f.pixel.y);
+        assert!(features(&image).iter().filter(covered).count() > 50);
+        let mut masked = extractor().keeping_pyramid(true).masked(mask.clone());
+        let Extraction { features, pyramid } = masked.extract(&image).unwrap();
+        assert!(features.len() > 100);
+        assert_eq!(features.iter().filter(covered).count(), 0);
+        // Nor is there anything to be recognised at a predicted place.
+        let black = frame(WIDTH, HEIGHT, vec![0; WIDTH * HEIGHT]);
+        let black = masked.extract(&black).unwrap().pyramid;
+        let place = Point2::new(130.0, 200.0);
+        let patch = |pyramid: &Pyramid| pyramid.look(place, 1.0).unwrap().patch;
+        assert_eq!(patch(&pyramid), patch(&black));
     }
 
     #[test]
