@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use mfg_vio::sensor::{
-    CameraConfig, ColorImage, DepthImage, PinholeCamera, PixelFormat, RgbdFrame, Stamp,
+    Camera, CameraConfig, ColorImage, DepthImage, PixelFormat, RgbdFrame, Stamp,
 };
 use mfg_vio::vision::{
     Correspondence, DepthConfig, Descriptor, Feature, FeatureConfig, Match, MatchingConfig,
@@ -70,7 +70,7 @@ fn tum(range: std::ops::Range<usize>) -> Option<Sequence> {
         fy: 516.5,
         cx: 318.6,
         cy: 255.3,
-        distortion: [0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
+        distortion: vec![0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
         ..CameraConfig::default()
     };
     let (depth, truth) = (rows(dir.join("depth.txt")), rows(dir.join("groundtruth.txt")));
@@ -158,7 +158,7 @@ fn median(mut values: Vec<f64>) -> f64 {
 
 /// Correspondences of matches whose two features have depth; the earlier frame is the world.
 fn correspondences(
-    camera: &PinholeCamera,
+    camera: &Camera,
     world: &[Feature],
     now: &[Feature],
     matches: &[Match],
@@ -195,7 +195,7 @@ struct Summary {
 }
 
 fn run(sequence: &Sequence, config: &FeatureConfig) -> Summary {
-    let camera = PinholeCamera::from(&sequence.camera);
+    let camera = Camera::new(&sequence.camera).unwrap();
     let matching = MatchingConfig::default();
     let mut extractor =
         OrbExtractor::new(config, &sequence.camera, &DepthConfig::default()).unwrap();
@@ -235,7 +235,8 @@ fn run(sequence: &Sequence, config: &FeatureConfig) -> Summary {
         // As with an IMU: the rotation known, the translation zero.
         let predicted = Isometry3::from_parts(Translation3::identity(), truth.rotation);
         let prediction = |f: &Feature| {
-            let point = f.measurement(&camera).map_or(camera.unproject(f.pixel, 2.0), |m| m.point);
+            let point = f.measurement(&camera).map(|m| m.point);
+            let point = point.or(camera.unproject(f.pixel, 2.0)).unwrap();
             let pixel = camera.project(&predicted.inverse_transform_point(&point.into()).coords);
             Prediction { descriptor: f.descriptor, pixel: pixel.unwrap_or_default(), radius: 20.0 }
         };

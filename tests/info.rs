@@ -5,7 +5,7 @@ mod support;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
-use support::{json, mfg_vio, recording, succeed, text};
+use support::{json, messages, mfg_vio, recording, succeed, text};
 
 /// Small images: what is checked are numbers, stamps and labels.
 const SMALL: &str = "
@@ -188,4 +188,127 @@ fn what_is_no_log_is_refused_in_one_line() {
     assert_eq!(message.lines().count(), 1);
     assert!(message.contains("notes.txt") && message.contains("it begins with `hello`"));
     assert_eq!(mfg_vio(&["info"]).status.code(), Some(2));
+}
+
+/// A hand-held motion of 8 s, large enough images for the estimator, and a copy of it each of whose
+/// messages is changed.
+fn moved(folder: &Path, change: impl FnMut(&mut messages::Message) -> bool) -> PathBuf {
+    static LOG: std::sync::OnceLock<(tempfile::TempDir, PathBuf)> = std::sync::OnceLock::new();
+    let (_, log) = LOG.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = "duration = 8.0\n[motion]\nkind = \"lab-motion\"\n[room]\ntexel = 0.01\n[image]\n\
+                     width = 320\nheight = 240\nrate = 20.0\n[camera]\nfx = 229.7\nfy = 229.9\n\
+                     cx = 166.1\ncy = 129.2\n";
+        let (config, log) = (folder.path().join("scene.toml"), folder.path().join("log.mcap"));
+        std::fs::write(&config, scene).unwrap();
+        succeed(&["simulate", "--config", text(&config), "--out", text(&log)]);
+        (folder, log)
+    });
+    let copy = folder.join("copy.mcap");
+    messages::changed(log, &copy, change);
+    copy
+}
+
+/// Changes the rates and the accelerations of every IMU message.
+fn with_imu(
+    folder: &Path,
+    change: impl Fn([f64; 3], [f64; 3]) -> ([f64; 3], [f64; 3]),
+    keeps_truth: bool,
+) -> PathBuf {
+    moved(folder, |message| {
+        if message.is("Imu") {
+            let (rates, accelerations) = change(message.rates(), message.accelerations());
+            message.set_imu(rates, accelerations);
+        }
+        keeps_truth || message.topic != "/truth/pose"
+    })
+}
+
+#[cfg(feature = "vision")]
+#[test]
+fn turned_axes_are_found_and_the_written_configuration_mends_them() {
+    let folder = tempfile::tempdir().unwrap();
+    // Turned by half about z, without a reference.
+    let turn = |[x, y, z]: [f64; 3]| [-x, -y, z];
+    let log = with_imu(folder.path(), |g, a| (turn(g), turn(a)), false);
+    let own = folder.path().join("own.toml");
+    let found = info(&log, &["--write-config", text(&own)]);
+    let axes = findings(&found, "imu", "turned by 180 degrees");
+    assert_eq!(axes.len(), 1, "{:#}", found["findings"]);
+    assert!(axes[0].1.contains("x = -x, y = -y, z = z"), "{axes:?}");
+    assert_eq!(found["verdict"]["fit"], true);
+    let metrics = json(&["replay", text(&log), "--config", text(&own), "--no-recording", "--json"]);
+    assert!(metrics["frames_processed"].as_u64().unwrap() > 150, "{metrics}");
+    let again = info(&log, &["--config", text(&own)]);
+    assert_eq!(findings(&again, "imu", "turn alike").len(), 1, "{:#}", again["findings"]);
+}
+
+#[cfg(feature = "vision")]
+#[test]
+fn left_handed_axes_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let swap = |[x, y, z]: [f64; 3]| [y, x, z];
+    let log = with_imu(folder.path(), |g, a| (swap(g), swap(a)), false);
+    let found = info(&log, &[]);
+    assert_eq!(findings(&found, "imu", "left-handed").len(), 1, "{:#}", found["findings"]);
+    assert_eq!(found["verdict"]["fit"], false);
+    assert!(found["verdict"]["text"].as_str().unwrap().ends_with("fit for attitude"));
+}
+
+#[cfg(feature = "vision")]
+#[test]
+fn units_are_found_by_the_images_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let degrees = |g: [f64; 3]| g.map(f64::to_degrees);
+    let log = with_imu(folder.path(), |g, a| (degrees(g), a), false);
+    let found = info(&log, &[]);
+    assert_eq!(findings(&found, "imu", "deg/s (by the turns of the images)").len(), 1);
+    assert_eq!(settings(&found), ["imu.gyroscope_scale=0.017453292519943295"]);
+}
+
+#[test]
+fn accelerometers_of_all_kinds_are_told_apart() {
+    let folder = tempfile::tempdir().unwrap();
+    let scaled = |factor: f64| move |a: [f64; 3]| a.map(|x| factor * x);
+    let in_g = with_imu(folder.path(), |g, a| (g, scaled(1.0 / 9.80665)(a)), true);
+    let found = info(&in_g, &[]);
+    assert!(findings(&found, "imu", ": g, sign regular")[0].1.contains("is set"), "{found:#}");
+    for (factor, part) in [(1.04, "% too large"), (1.17, "% too large"), (0.93, "% too small")] {
+        let log = with_imu(folder.path(), |g, a| (g, scaled(factor)(a)), true);
+        let found = info(&log, &[]);
+        let off = findings(&found, "imu", part);
+        assert_eq!(off.len(), 1, "{factor}: {:#}", found["findings"]);
+        let advised = settings(&found)[0].strip_prefix("imu.accelerometer_scale=").unwrap();
+        let advised: f64 = advised.parse().unwrap();
+        assert!((advised * factor - 1.0).abs() < 0.01, "{factor}: {advised}");
+    }
+    let log = with_imu(folder.path(), |g, _| (g, [0.0; 3]), true);
+    let found = info(&log, &[]);
+    assert_eq!(findings(&found, "imu", "reads zero throughout").len(), 1, "{found:#}");
+    assert_eq!(found["verdict"]["fit"], false);
+}
+
+#[test]
+fn clocks_that_do_not_overlap_are_told_with_their_spans() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = moved(folder.path(), |message| {
+        if message.is("Imu") {
+            message.delay(1000);
+        }
+        true
+    });
+    let found = info(&log, &[]);
+    let spans = findings(&found, "imu", "stamps of /imu cover 1100.000 to 1108.000 s");
+    assert!(spans[0].1.contains("of /cam0/color 100.000 to 108.000 s"), "{found:#}");
+    assert_eq!(found["verdict"]["fit"], false);
+}
+
+#[test]
+fn missing_calibration_is_no_fit_log() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = moved(folder.path(), |message| !message.is("CameraInfo"));
+    let found = info(&log, &[]);
+    assert_eq!(findings(&found, "color", "no calibration of the camera").len(), 1);
+    assert_eq!(found["verdict"]["fit"], false);
+    assert_eq!(found["verdict"]["fit_for"][0], "attitude");
 }

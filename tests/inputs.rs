@@ -176,7 +176,8 @@ fn the_united_topic_is_preferred_and_a_lone_gyroscope_is_no_imu() {
 
 /// The root mean square of the position error, m, and the frames that were processed.
 fn replayed(path: &Path) -> (f64, u64) {
-    let metrics = json(&["replay", text(path), "--json"]);
+    // The fixtures have no CameraInfo.
+    let metrics = json(&["replay", text(path), "--config", "configs/sim.toml", "--json"]);
     let error = metrics["evaluation"]["ape_translation"]["rmse"].as_f64();
     (error.unwrap_or_else(|| panic!("{metrics}")), metrics["frames_processed"].as_u64().unwrap())
 }

@@ -34,7 +34,7 @@ pub fn read(path: &Path) {
             }
         }
     }
-    let assumed = Assumed { log: &config, imu: &imu, body_from_camera: None };
+    let assumed = Assumed::new(&config, &imu);
     let _ = inspect(path, &assumed);
     let output = path.with_extension("mcap.out");
     let go_on = || ControlFlow::Continue(());

@@ -16,8 +16,8 @@ use super::plan::{Plan, PlannedRun};
 use super::recipe::{SeededScene, remove};
 use super::record::{Outcome, RunRecord, Store, Times};
 use super::tables;
-use crate::config::Config;
-use crate::dataset::{Fault, LogSummary, detect};
+use crate::config::Resolved;
+use crate::dataset::Fault;
 use crate::evaluation::Trajectory;
 use crate::filter::{FilterKind, MapTreatment};
 use crate::inertial::{block, pose_covariance};
@@ -231,8 +231,9 @@ impl Part<'_> {
         progress: &mut dyn Progress,
         (done, planned): (usize, usize),
     ) -> Result<(Outcome, Option<f64>), BenchError> {
-        let summary = detect(self.log)?;
-        let config = self.config(&summary)?;
+        let resolved = self.resolve()?;
+        let config_origin = resolved.name();
+        let Resolved { config, summary, .. } = resolved;
         let filter = self.run.filter.parse::<FilterKind>();
         let filter =
             filter.map_err(|reason| BenchError::Format { path: self.log.to_owned(), reason })?;
@@ -250,7 +251,7 @@ impl Part<'_> {
         let request = Request {
             log: self.log.to_owned(),
             config,
-            config_origin: summary.config_name.clone(),
+            config_origin,
             filter,
             seed: self.run.seed,
             threads: workshop.threads,
@@ -267,14 +268,14 @@ impl Part<'_> {
         Ok((outcome, Some(replayed.metrics.cpu_seconds)))
     }
 
-    fn config(&self, summary: &LogSummary) -> Result<Config, BenchError> {
-        let settings = &self.run.settings;
+    fn resolve(&self) -> Result<Resolved, BenchError> {
         let file = self.plan.config.as_ref().map(|(path, _)| path.as_path());
-        let mut config = Config::for_log(summary, file, settings)?;
+        let mut resolved = Resolved::of(self.log, file, &self.run.settings)?;
+        resolved.require_calibration()?;
         if let Some(mode) = self.run.init {
-            config.init.mode = mode;
+            resolved.config.init.mode = mode;
         }
-        Ok(config)
+        Ok(resolved)
     }
 
     fn outcome(&self, replayed: &Replayed, gathered: Gathered, faults: &[Fault]) -> Outcome {

@@ -26,8 +26,7 @@ pub struct Args {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     catch_interrupts()?;
-    let summary = dataset::detect(&args.input)?;
-    let config = args.setup.config(&summary)?;
+    let config = args.setup.resolve(&args.input)?.config;
     let bar = progress(None, "messages");
     let (input, output) = (&args.input, &args.output);
     let written = dataset::convert(input, output, &config.log, &config.camera, || {

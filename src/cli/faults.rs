@@ -6,8 +6,8 @@ use anyhow::Context;
 use super::replay::{Plan, Settings};
 use super::results::Results;
 use super::terminal::{INTERRUPTED, catch_interrupts, print};
-use mfg_vio::config::Config;
-use mfg_vio::dataset::{self, Fault};
+use mfg_vio::config::Resolved;
+use mfg_vio::dataset::Fault;
 use mfg_vio::evaluation::Table;
 use mfg_vio::replay::{FaultOutcome, confusion, fault_grid};
 
@@ -93,11 +93,11 @@ fn check_within(faults: &[Fault], seconds: f64) -> anyhow::Result<()> {
 
 /// A failed run is an outcome; what prevents all of them is an error.
 fn outcome(args: &FaultsArgs, fault: Option<&Fault>) -> anyhow::Result<FaultOutcome> {
-    let summary = dataset::detect(&args.log)?;
     let file = args.config.as_deref();
-    let config = Config::for_log(&summary, file, args.settings.overrides())?;
-    let config_origin =
-        file.map_or_else(|| summary.config_name.clone(), |file| file.display().to_string());
+    let resolved = Resolved::of(&args.log, file, args.settings.overrides())?;
+    resolved.require_calibration()?;
+    let config_origin = resolved.name();
+    let Resolved { config, summary, .. } = resolved;
     let out = args.out.as_deref().map(|out| folder(out, fault));
     out.as_deref().map_or(Ok(()), |out| Results::of("replay").remove(out))?;
     let plan = Plan {

@@ -1,24 +1,34 @@
 use std::fmt::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
 
 use super::terminal::print;
-use mfg_vio::config::Config;
-use mfg_vio::dataset::{self, Assumed, Inspection, LogSummary, Severity, TopicInspection};
-use mfg_vio::sensor::CameraConfig;
+use mfg_vio::config::Resolved;
+use mfg_vio::dataset::{self, Assumed, Inspection, Severity, TopicInspection};
+use mfg_vio::output;
+#[cfg(feature = "vision")]
+use mfg_vio::replay::{Tried, try_out as try_out_log};
 
 /// Tell what is in a log and whether it is fit for visual-inertial odometry.
 ///
-/// Checks rates, gaps, order and clocks of all topics, units and sign of the IMU, channel order of
-/// color, unit and validity of depth against the configuration with which the log would be
-/// replayed, and ends in a verdict with the settings to change.
+/// Checks rates, gaps, order and clocks of all topics, units, sign and axes of the IMU (by gravity
+/// and by turns that images and gyroscope both see), channel order of color, unit and validity of
+/// depth against the configuration with which the log would be replayed, starts the estimator, and
+/// ends in a verdict with the settings to change.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  mfg-vio info lab_bumper1.bag\n  \
+#[command(after_help = "Example:\n  mfg-vio info lab_bumper1.bag --write-config own.toml\n  \
+                        mfg-vio replay lab_bumper1.bag --config own.toml\n  \
                         mfg-vio info lab_bumper1.bag --json | jq .verdict")]
 pub struct Args {
     /// The log: a file or a folder.
     log: PathBuf,
     #[command(flatten)]
     setup: Setup,
+    /// Write the configuration for this log, with everything that was found, to a file for
+    /// --config.
+    #[arg(long, value_name = "FILE")]
+    write_config: Option<PathBuf>,
     /// Print everything as one JSON object.
     #[arg(long)]
     json: bool,
@@ -36,37 +46,85 @@ pub struct Setup {
 }
 
 impl Setup {
-    pub fn config(&self, summary: &LogSummary) -> anyhow::Result<Config> {
-        Ok(Config::for_log(summary, self.config.as_deref(), &self.overrides)?)
+    pub fn resolve(&self, log: &Path) -> anyhow::Result<Resolved> {
+        Ok(Resolved::of(log, self.config.as_deref(), &self.overrides)?)
     }
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
-    let summary = dataset::detect(&args.log)?;
-    let config = args.setup.config(&summary)?;
-    // A layout that is merely not known says nothing about the mounting of the camera.
-    let is_known =
-        args.setup.config.is_some() || summary.is_stereo() || summary.config_name == "vcu_rvi";
-    let camera = summary.camera.as_ref().or(is_known.then_some(&config.camera));
-    let body_from_camera = camera.and_then(CameraConfig::imu_from_camera);
-    let assumed = Assumed { log: &config.log, imu: &config.imu, body_from_camera };
+    let resolved = args.setup.resolve(&args.log)?;
+    let config = &resolved.config;
+    let assumed = Assumed {
+        log: &config.log,
+        imu: &config.imu,
+        body_from_camera: resolved
+            .has_mounting()
+            .then(|| config.camera.imu_from_camera())
+            .flatten(),
+        time_offset: config.camera.time_offset,
+        missing: resolved.missing(),
+    };
     let inspection = dataset::inspect(&args.log, &assumed)?;
+    let inspection = try_out(args, inspection, &resolved, &assumed)?;
+    if let Some(file) = &args.write_config {
+        write_config(file, &resolved, &inspection)?;
+    }
     if args.json {
         return print(&serde_json::to_string_pretty(&inspection)?);
     }
-    let name = match &args.setup.config {
-        Some(path) => path.display().to_string(),
-        None => format!("configs/{}.toml", summary.config_name),
-    };
     let mut text = String::new();
-    describe(&mut text, &inspection, &name)?;
+    describe(&mut text, &inspection, &resolved.name())?;
+    if let Some(file) = &args.write_config {
+        writeln!(text, "configuration: {}", file.display())?;
+    }
     print(&text)
+}
+
+/// Starts the estimator on the log; its own messages would only confuse.
+#[cfg(feature = "vision")]
+fn try_out(
+    args: &Args,
+    inspection: Inspection,
+    resolved: &Resolved,
+    assumed: &Assumed,
+) -> anyhow::Result<Inspection> {
+    let Setup { config, overrides } = &args.setup;
+    let tried = Tried { log: &args.log, file: config.as_deref(), overrides };
+    let quiet = tracing::subscriber::NoSubscriber::default();
+    let done = tracing::subscriber::with_default(quiet, || {
+        try_out_log(inspection, tried, resolved, assumed)
+    });
+    Ok(done?)
+}
+
+#[cfg(not(feature = "vision"))]
+fn try_out(
+    _: &Args,
+    inspection: Inspection,
+    _: &Resolved,
+    _: &Assumed,
+) -> anyhow::Result<Inspection> {
+    Ok(inspection)
+}
+
+/// Writes the configuration of the log with everything that was found.
+fn write_config(file: &Path, resolved: &Resolved, inspection: &Inspection) -> anyhow::Result<()> {
+    let findings = inspection.findings.iter();
+    let found = findings.filter_map(|finding| {
+        let (key, value) = finding.setting.as_deref()?.split_once('=')?;
+        Some((key.to_owned(), value.to_owned(), finding.message.clone()))
+    });
+    let text = resolved.to_toml(&found.collect::<Vec<_>>())?;
+    output::write(file, text).with_context(|| format!("{}", file.display()))?;
+    Ok(())
 }
 
 fn describe(out: &mut String, inspection: &Inspection, config: &str) -> fmt::Result {
     writeln!(out, "{}, {:.2} s; read with {config}", inspection.summary.kind, inspection.duration)?;
     for (role, source) in &inspection.summary.sources {
-        writeln!(out, "  {role:<6} {source}")?;
+        let others = inspection.summary.others.get(role).map(|others| others.join(", "));
+        let others = others.map(|others| format!("  (not {others}: log.{role}_topic)"));
+        writeln!(out, "  {role:<6} {source}{}", others.unwrap_or_default())?;
     }
     writeln!(
         out,

@@ -3,6 +3,7 @@
 mod attitude;
 #[cfg(feature = "vision")]
 mod bench;
+mod config;
 mod convert;
 #[cfg(feature = "vision")]
 mod demo;
@@ -49,6 +50,7 @@ enum Command {
     Bench(bench::BenchArgs),
     Simulate(simulate::SimulateArgs),
     Attitude(attitude::AttitudeArgs),
+    Config(config::Args),
     Convert(convert::Args),
     Info(info::Args),
     Evaluate(evaluate::EvaluateArgs),
@@ -112,6 +114,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Bench(args) => bench::run(&args),
         Command::Simulate(args) => simulate::run(args),
         Command::Attitude(args) => attitude::run(&args),
+        Command::Config(args) => config::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Info(args) => info::run(&args),
         Command::Evaluate(args) => evaluate::run(args),

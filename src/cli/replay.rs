@@ -5,14 +5,14 @@ use indicatif::ProgressBar;
 use nalgebra::Isometry3;
 
 use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
-use mfg_vio::config::Config;
-use mfg_vio::dataset::{self, Fault, LogSummary};
+use mfg_vio::config::{Config, Origin, Resolved};
+use mfg_vio::dataset::{Fault, LogSummary};
 use mfg_vio::filter::{FilterKind, MapTreatment};
 use mfg_vio::odometry::{InitMode, StepReport};
 use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
 use mfg_vio::sensor::RgbdFrame;
 #[cfg(feature = "viewer")]
-use mfg_vio::sensor::{ImuSample, PinholeCamera};
+use mfg_vio::sensor::{Camera, ImuSample};
 use mfg_vio::viewer::{Contents, Purpose};
 #[cfg(feature = "viewer")]
 use mfg_vio::viewer::{Recorder, Sink};
@@ -110,8 +110,9 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 pub fn run(args: &Args) -> anyhow::Result<()> {
     catch_interrupts()?;
-    let summary = dataset::detect(&args.log)?;
-    let (config, config_origin) = load_config(args, &summary)?;
+    let resolved = resolve(args)?;
+    let config_origin = resolved.name();
+    let Resolved { config, summary, .. } = resolved;
     let plan = Plan {
         log: &args.log,
         settings: &args.settings,
@@ -133,17 +134,25 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
     }
 }
 
-fn load_config(args: &Args, summary: &LogSummary) -> anyhow::Result<(Config, String)> {
-    let config = Config::for_log(summary, args.config.as_deref(), &args.settings.overrides)?;
-    let origin = match &args.config {
-        Some(path) => path.display().to_string(),
-        None => {
-            let name = &summary.config_name;
-            tracing::info!("{}: using the shipped configuration `{name}`", summary.kind);
-            name.clone()
-        }
-    };
-    Ok((config, origin))
+/// The configuration for the log; what is remarkable about it is told.
+fn resolve(args: &Args) -> anyhow::Result<Resolved> {
+    let resolved = Resolved::of(&args.log, args.config.as_deref(), &args.settings.overrides)?;
+    resolved.require_calibration()?;
+    let summary = &resolved.summary;
+    if args.config.is_none() {
+        tracing::info!("{}: using the shipped configuration `{}`", summary.kind, resolved.name());
+    }
+    let told = |origin: &Origin| matches!(origin, Origin::Log(_) | Origin::SensorClass(_));
+    for setting in resolved.settings().iter().filter(|setting| told(&setting.origin)) {
+        tracing::debug!("{} = {} ({})", setting.key, setting.value, setting.origin);
+    }
+    for conflict in &resolved.conflicts {
+        tracing::warn!("{conflict}");
+    }
+    for problem in &summary.calibration.problems {
+        tracing::warn!("{problem}");
+    }
+    Ok(resolved)
 }
 
 /// Where a recording goes.
@@ -205,7 +214,8 @@ impl Plan<'_> {
             && filter.map_treatment() == MapTreatment::Correlated;
         let config = &self.config;
         let mut front_end = OrbExtractor::new(&config.features, &config.camera, &config.depth)?
-            .keeping_pyramid(seeks);
+            .keeping_pyramid(seeks)
+            .masked(config.log.mask.load()?);
         let contents = Contents {
             name: format!("{}, {}, seed {}", self.log.display(), filter, self.settings.seed),
             truth: self.truth.is_some() || self.summary.has_truth,
@@ -249,7 +259,7 @@ struct Recording {
     #[cfg(feature = "viewer")]
     map_every: u64,
     #[cfg(feature = "viewer")]
-    camera: Option<(PinholeCamera, Isometry3<f64>)>,
+    camera: Option<(Camera, Isometry3<f64>)>,
 }
 
 #[cfg(feature = "viewer")]
@@ -269,7 +279,7 @@ impl Recording {
         Ok(Self {
             recorder,
             map_every: config.recording.map_every,
-            camera: Some(((&config.camera).into(), mounting.unwrap_or_default())),
+            camera: Some((config.lens()?, mounting.unwrap_or_default())),
         })
     }
 

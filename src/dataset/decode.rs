@@ -147,11 +147,7 @@ impl RosSource {
                 return Err(missing(role));
             }
         }
-        for (role, topic) in &chosen {
-            if role.configured(log).is_empty() {
-                tracing::info!("{}: {topic} (chosen by message type)", role.name());
-            }
-        }
+        survey.choices(&chosen, log).iter().for_each(|line| tracing::info!("{line}"));
         if let Some(topic) = survey.lone_gyroscope().filter(|_| !chosen.contains_key(&Role::Imu)) {
             tracing::warn!("imu: {topic} has no accelerometer, and no other topic has: not used");
         }

@@ -15,7 +15,7 @@ use super::text_table::Row;
 use super::{LogConfig, LogError, LogSummary, TruthPose};
 use crate::dialect::{Dialect, PoseColumns, TimeUnit};
 use crate::inertial::ImuConfig;
-use crate::sensor::{CameraConfig, ImuSample, Stamp};
+use crate::sensor::{CameraConfig, CameraModel, ImuSample, Stamp};
 use crate::vision::StereoRig;
 
 const LEFT: &str = "cam0";
@@ -281,23 +281,25 @@ fn camera(folder: &Path) -> Result<(CameraConfig, (usize, usize)), LogError> {
     fn of<const N: usize>(list: Option<&str>) -> Option<[f64; N]> {
         numbers(list?).ok()
     }
-    if !text.contains("radial-tangential") {
-        return Err(missing("distortion_model: radial-tangential"));
-    }
+    // TUM-VI's folders have fisheye lenses.
+    let model = [CameraModel::RadialTangential, CameraModel::Equidistant]
+        .into_iter()
+        .find(|model| text.contains(model.name()))
+        .ok_or_else(|| missing("distortion_model: radial-tangential or equidistant"))?;
     let mount: [f64; 16] = of(list("data")).ok_or_else(|| missing("T_BS"))?;
     let [fx, fy, cx, cy] = of(list("intrinsics")).ok_or_else(|| missing("intrinsics"))?;
-    let [k1, k2, p1, p2] =
+    let distortion: [f64; 4] =
         of(list("distortion_coefficients")).ok_or_else(|| missing("distortion_coefficients"))?;
     let [width, height] = of(list("resolution")).ok_or_else(|| missing("resolution"))?;
     let camera = CameraConfig {
+        model,
         fx,
         fy,
         cx,
         cy,
-        distortion: [k1, k2, p1, p2, 0.0],
+        distortion: distortion.to_vec(),
         imu_from_camera: std::array::from_fn(|r| std::array::from_fn(|c| mount[4 * r + c])),
-        time_offset: 0.0,
-        readout_time: 0.0,
+        ..CameraConfig::default()
     };
     Ok((camera, (width as usize, height as usize)))
 }

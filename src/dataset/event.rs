@@ -1,9 +1,12 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use nalgebra::{Isometry3, Matrix4};
 use serde::{Deserialize, Serialize};
 
+use super::found::FoundCalibration;
 use crate::sensor::{CameraConfig, Event, Stamp};
+use crate::vision::MaskConfig;
 
 /// What a reader met: counts that end up in `metrics.json`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -50,6 +53,10 @@ pub struct LogSummary {
     pub frames: Option<u64>,
     /// Calibration of the color camera and its mounting on the IMU, where the log tells both.
     pub camera: Option<CameraConfig>,
+    /// What its messages tell of calibrations.
+    pub calibration: FoundCalibration,
+    /// For a role, the topics that could have played it, too, with their rates.
+    pub others: BTreeMap<String, Vec<String>>,
 }
 
 impl LogSummary {
@@ -101,6 +108,11 @@ pub struct LogConfig {
     pub reorder_window: f64,
     /// The left and the right camera as their topics are logged; empty where depth is logged.
     pub stereo: Vec<CameraConfig>,
+    /// Row-major 4x4 matrix that maps IMU coordinates to those of the body whose poses the
+    /// reference gives (a marker).
+    pub truth_body_from_imu: [[f64; 4]; 4],
+    /// Part of the color image without features: the robot's own body.
+    pub mask: MaskConfig,
 }
 
 impl Default for LogConfig {
@@ -118,6 +130,8 @@ impl Default for LogConfig {
             max_pair_difference: 0.02,
             reorder_window: 0.5,
             stereo: Vec::new(),
+            truth_body_from_imu: Matrix4::identity().into(),
+            mask: MaskConfig::default(),
         }
     }
 }
@@ -137,6 +151,10 @@ impl LogConfig {
             let count = format!("[{} cameras]", self.stereo.len());
             return error("stereo", count, "the left and the right camera, or none");
         }
+        if rigid_motion(&self.truth_body_from_imu).is_none() {
+            let matrix = format!("{:?}", self.truth_body_from_imu);
+            return error("truth_body_from_imu", matrix, "a rigid motion (row-major 4x4)");
+        }
         let times = [
             ("max_pair_difference", self.max_pair_difference),
             ("reorder_window", self.reorder_window),
@@ -148,6 +166,12 @@ impl LogConfig {
         }
         Ok(())
     }
+}
+
+/// The motion of a row-major 4x4 matrix; `None` if it is not close to a rigid one.
+pub(super) fn rigid_motion(matrix: &[[f64; 4]; 4]) -> Option<Isometry3<f64>> {
+    // The check is that of a camera's mounting.
+    CameraConfig { imu_from_camera: *matrix, ..CameraConfig::default() }.imu_from_camera()
 }
 
 /// A log that cannot be read at all.

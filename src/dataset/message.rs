@@ -123,11 +123,11 @@ impl<'a> Fields<'a> {
         self.primitive().map(u16::from_le_bytes)
     }
 
-    fn u32(&mut self) -> Result<u32, Rejection> {
+    pub fn u32(&mut self) -> Result<u32, Rejection> {
         self.primitive().map(u32::from_le_bytes)
     }
 
-    fn f64(&mut self) -> Result<f64, Rejection> {
+    pub fn f64(&mut self) -> Result<f64, Rejection> {
         self.primitive().map(f64::from_le_bytes)
     }
 
@@ -150,8 +150,13 @@ impl<'a> Fields<'a> {
         std::str::from_utf8(bytes).map_err(|e| Rejection::new("text is not UTF-8", e.to_string()))
     }
 
-    /// `std_msgs/Header`.
+    /// The stamp of a `std_msgs/Header`.
     pub fn header(&mut self) -> Result<Stamp, Rejection> {
+        self.header_and_frame().map(|(stamp, _)| stamp)
+    }
+
+    /// `std_msgs/Header`; a frame that is no UTF-8 counts as none.
+    pub fn header_and_frame(&mut self) -> Result<(Stamp, &'a str), Rejection> {
         let seconds = match self.layout {
             Layout::Ros1 => {
                 let _sequence = self.u32()?;
@@ -163,8 +168,9 @@ impl<'a> Fields<'a> {
         if nanos >= 1_000_000_000 {
             return Err(Rejection::new("invalid stamp", format!("{seconds} s and {nanos} ns")));
         }
-        let _frame = self.byte_sequence()?;
-        Ok(Stamp::from_parts(seconds, i64::from(nanos)))
+        let frame = self.byte_sequence()?;
+        let frame = std::str::from_utf8(frame.strip_suffix(&[0]).unwrap_or(frame));
+        Ok((Stamp::from_parts(seconds, i64::from(nanos)), frame.unwrap_or_default()))
     }
 
     pub fn vector(&mut self) -> Result<Vector3<f64>, Rejection> {

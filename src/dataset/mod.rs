@@ -5,6 +5,7 @@
 //! yield readings directly, and [`merge`] orders and pairs the readings. A log that is cut or damaged yields all that can still be read.
 
 mod bag;
+mod calibration;
 mod compressed;
 mod convert;
 mod database;
@@ -16,9 +17,11 @@ mod euroc;
 mod event;
 mod fault;
 mod folder;
+mod found;
 mod imu_csv;
 mod inertial_halves;
 mod inspect;
+mod layout;
 mod mcap_file;
 mod merge;
 mod message;
@@ -44,6 +47,7 @@ mod seven_scenes;
 mod stereo;
 mod stray;
 mod text_table;
+mod topics;
 mod tum;
 mod write;
 
@@ -52,13 +56,15 @@ use crate::sensor::{Event, RgbdFrame, TruthPose};
 pub use convert::{ConvertError, ConvertSummary, convert};
 pub use event::{Log, LogConfig, LogError, LogSummary, ReadReport};
 pub use fault::{Fault, FaultKind};
+pub use found::{FoundCalibration, FoundIn, FoundSetting};
 pub use imu_csv::{ImuCsv, ImuRow};
 pub use inspect::{
-    AccelerometerUnit, Assumed, ColorInspection, DepthInspection, Evidence, Finding, Gap,
-    GyroscopeUnit, ImuInspection, Inspection, LogClock, PairInspection, Severity, Sign, Timing,
-    TopicInspection, Verdict, inspect,
+    AccelerometerFit, AccelerometerUnit, Assumed, ColorInspection, DepthInspection, Evidence,
+    Finding, Gap, GyroscopeUnit, ImuInspection, Inspection, LogClock, PairInspection, Severity,
+    Sign, TURN_SPAN, Timing, TopicInspection, Trial, TurnInspection, Verdict, inspect,
 };
+pub use layout::Layout;
 pub use navigation::{NavigationLog, NavigationTopics, read_navigation};
 pub use navigation_csv::{read_imu_table, read_position_table};
-pub use open::{detect, open, open_with_faults};
+pub use open::{detect, detect_with, open, open_with_faults};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

@@ -2,14 +2,17 @@
 
 use std::path::Path;
 
+use nalgebra::Isometry3;
+
 use super::bag::{Bag, BagFormat};
 use super::database::{DatabaseFile, MAGIC};
 use super::decode::RosSource;
+use super::event::rigid_motion;
 use super::fault::FaultySource;
 use super::folder::{FolderSource, Listing};
 use super::inertial_halves::UnitedSource;
 use super::mcap_file::{McapFile, McapFormat};
-use super::merge::{MergedLog, ReadingSource};
+use super::merge::{MergedLog, Reading, ReadingSource};
 use super::nmea::is_nmea;
 use super::records::Format as _;
 use super::registration::RegisteredSource;
@@ -18,7 +21,8 @@ use super::rosbag2::{self, Chain, Unpacked, ZSTD_MAGIC};
 use super::section::{LogFile, decompress, first_bytes};
 use super::stereo::StereoSource;
 use super::{
-    Fault, Log, LogConfig, LogError, LogSummary, euroc, openloris, seven_scenes, stray, tum,
+    Fault, Log, LogConfig, LogError, LogSummary, ReadReport, TruthPose, euroc, openloris,
+    seven_scenes, stray, tum,
 };
 use crate::inertial::ImuConfig;
 use crate::vision::StereoRig;
@@ -176,7 +180,7 @@ pub fn open_with_faults(
             let registration = listing.registration.clone();
             let source = UnitedSource::new(FolderSource::new(listing, log, imu), imu);
             let source = RegisteredSource::new(source, registration);
-            let source = FaultySource::new(source, faults, imu);
+            let source = FaultySource::new(ReferenceOfImu::new(source, log), faults, imu);
             match stereo {
                 Some(rig) => stereo_log(source, summary, rig, log),
                 None => {
@@ -192,13 +196,41 @@ pub fn open_with_faults(
             let place = (path, messages.kind());
             let (source, summary, rig) =
                 RosSource::new(messages.messages(), &survey, place, log, imu)?;
-            let source = FaultySource::new(UnitedSource::new(source, imu), faults, imu);
+            let registration = summary.calibration.registration.clone();
+            let source = RegisteredSource::new(UnitedSource::new(source, imu), registration);
+            let source = FaultySource::new(ReferenceOfImu::new(source, log), faults, imu);
             match rig {
                 Some(rig) => stereo_log(source, summary, rig, log),
                 None => Box::new(MergedLog::new(source, summary, log)),
             }
         }
     })
+}
+
+/// Brings the poses of the reference's body to the IMU.
+struct ReferenceOfImu<S> {
+    source: S,
+    body_from_imu: Isometry3<f64>,
+}
+
+impl<S> ReferenceOfImu<S> {
+    fn new(source: S, log: &LogConfig) -> Self {
+        let body_from_imu = rigid_motion(&log.truth_body_from_imu).unwrap_or_default();
+        Self { source, body_from_imu }
+    }
+}
+
+impl<S: ReadingSource> ReadingSource for ReferenceOfImu<S> {
+    fn next_reading(&mut self, report: &mut ReadReport) -> Option<Reading> {
+        let reading = self.source.next_reading(report)?;
+        Some(match reading {
+            Reading::Truth(pose) if self.body_from_imu != Isometry3::identity() => {
+                let world_from_body = pose.world_from_body * self.body_from_imu;
+                Reading::Truth(TruthPose { world_from_body, ..pose })
+            }
+            other => other,
+        })
+    }
 }
 
 fn stereo_log(
@@ -218,10 +250,18 @@ fn stereo_log(
 /// [`LogError::UnknownFormat`] if it is no log that is read, [`LogError::MissingStream`] if a
 /// folder lacks its image lists, [`LogError::Io`] if it cannot be read.
 pub fn detect(path: &Path) -> Result<LogSummary, LogError> {
-    Ok(match Contents::of(path, &LogConfig::default())? {
+    detect_with(path, &LogConfig::default())
+}
+
+/// As [`detect`], with the topics that `log` names.
+///
+/// # Errors
+/// Those of [`detect`].
+pub fn detect_with(path: &Path, log: &LogConfig) -> Result<LogSummary, LogError> {
+    Ok(match Contents::of(path, log)? {
         Contents::Folder(folder) => folder.0,
         Contents::Messages(messages) => {
-            Survey::new(messages.messages().as_mut()).summary(messages.kind())
+            Survey::new(messages.messages().as_mut()).summary(messages.kind(), log)
         }
     })
 }
@@ -433,7 +473,7 @@ mod tests {
                     assert!(read_all(log.as_mut()).len() <= samples.len());
                 }
                 let (log, imu) = (LogConfig::default(), ImuConfig::default());
-                let assumed = Assumed { log: &log, imu: &imu, body_from_camera: None };
+                let assumed = Assumed::new(&log, &imu);
                 let _ = inspect(&path, &assumed);
                 let output = path.with_extension("mcap");
                 let go_on = || ControlFlow::Continue(());
@@ -513,7 +553,7 @@ mod tests {
                 *sample = samples::imu(false, 1000 + number as i64, 9.81);
             }
         }
-        assert_eq!(detect(&bag(&folder, &samples)).unwrap().config_name, "sim");
+        assert_eq!(detect(&bag(&folder, &samples)).unwrap().config_name, "generic");
     }
 
     #[test]

@@ -143,7 +143,7 @@ fn camera(folder: &Path, transforms: &Transforms) -> Result<Option<CameraConfig>
         fy,
         cx,
         cy,
-        distortion,
+        distortion: distortion.to_vec(),
         imu_from_camera: std::array::from_fn(|r| std::array::from_fn(|c| mount[(r, c)])),
         ..CameraConfig::default()
     }))

@@ -4,14 +4,16 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::Path;
 
+use super::calibration::{Observed, Streams};
 use super::compressed::CompressedHead;
 use super::decode::Decoder;
 use super::encoding::{ColorEncoding, DepthEncoding, SUPPORTED_COLOR, SUPPORTED_DEPTH};
+use super::found::{FoundCalibration, FoundSetting};
 use super::message::{self, Fields, MessageType, Serialization};
 use super::navigation::NavigationTopics;
 use super::pixels::Rejection;
 use super::write::{CAMERA, CONFIGURATION};
-use super::{LogConfig, LogError, LogSummary, ReadReport};
+use super::{LogConfig, LogError, LogSummary, ReadReport, topics};
 use crate::inertial::ImuConfig;
 use crate::sensor::{CameraConfig, Stamp};
 use crate::vision::StereoRig;
@@ -121,6 +123,14 @@ impl Role {
             Self::Right => "right",
             Self::Gnss => "gnss",
             Self::Magnetic => "magnetic",
+        }
+    }
+
+    /// The key of [`LogConfig`] with its topic.
+    fn setting(self) -> String {
+        match self {
+            Self::Accelerometer => "accel_topic".to_owned(),
+            role => format!("{}_topic", role.key()),
         }
     }
 
@@ -295,14 +305,12 @@ impl Topic {
                 name.to_lowercase().contains("mag").then_some(1)
             }
             Role::Magnetic => Some(0),
+            Role::Truth if topics::is_no_reference(name) => None,
             Role::Truth => match kind {
                 MessageType::PoseStamped => Some(0),
                 MessageType::TransformStamped => Some(1),
                 // Most odometry topics are estimates, not a reference.
-                _ => ["truth", "gt", "mocap", "vicon"]
-                    .iter()
-                    .any(|word| name.contains(word))
-                    .then_some(2),
+                _ => topics::is_reference(name).then_some(2),
             },
         }
     }
@@ -385,6 +393,25 @@ impl ImageHead {
     }
 }
 
+/// Messages of each topic that has rivals that are looked at to tell their rates.
+const SURVEY_RIVALS: u32 = 10;
+
+/// Whether enough is known of topics that compete for a role, and of those with calibrations.
+fn is_compared(topics: &BTreeMap<String, Topic>, observed: &Observed) -> bool {
+    let rivals = |kind| topics.values().filter(|topic| topic.kind == Some(kind)).count();
+    topics.iter().all(|(name, topic)| match topic.kind {
+        Some(MessageType::CameraInfo) => observed.count(name) > 0,
+        Some(MessageType::Transforms) => observed.has_transforms_of(name),
+        Some(
+            kind @ (MessageType::Imu
+            | MessageType::Image
+            | MessageType::CompressedImage
+            | MessageType::PoseStamped),
+        ) => rivals(kind) < 2 || observed.count(name) >= SURVEY_RIVALS,
+        _ => true,
+    })
+}
+
 /// The topics of a log, by name.
 #[derive(Debug, Clone)]
 pub(super) struct Survey {
@@ -392,6 +419,7 @@ pub(super) struct Survey {
     /// As this program noted them when it wrote the log.
     configuration: Option<String>,
     camera: Option<CameraConfig>,
+    observed: Observed,
 }
 
 impl Survey {
@@ -399,6 +427,7 @@ impl Survey {
     pub fn new(messages: &mut dyn MessageSource) -> Self {
         let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
         let (mut count, mut bytes) = (0, 0);
+        let mut observed = Observed::default();
         for channel in messages.channels() {
             topics.entry(channel.topic.clone()).or_insert_with(|| Topic::new(channel));
         }
@@ -410,6 +439,9 @@ impl Survey {
                 let topic =
                     topics.entry(channel.topic.clone()).or_insert_with(|| Topic::new(channel));
                 let _ = topic.observe(message);
+                if let Some(kind) = channel.readable() {
+                    let _ = observed.observe(&channel.topic, kind, message.data);
+                }
                 count += 1;
                 bytes += message.data.len();
             });
@@ -418,13 +450,14 @@ impl Survey {
                     && (topic.kind != Some(MessageType::Imu)
                         || topic.halves.count() == SURVEY_IMU_SAMPLES)
             };
-            if !more || messages.is_indexed() && topics.values().all(known) {
+            let is_surveyed = topics.values().all(known) && is_compared(&topics, &observed);
+            if !more || messages.is_indexed() && is_surveyed {
                 break;
             }
         }
         let note = |key| messages.channels().iter().find_map(|c| c.metadata.get(key).cloned());
         let camera = note(CAMERA).and_then(|text| serde_json::from_str(&text).ok());
-        Self { topics, configuration: note(CONFIGURATION), camera }
+        Self { topics, configuration: note(CONFIGURATION), camera, observed }
     }
 
     /// Topics with their types and encodings, for messages to the user.
@@ -437,18 +470,81 @@ impl Survey {
         if topics.is_empty() { "no topics".to_owned() } else { topics.join(", ") }
     }
 
-    fn best(&self, role: Role, color_size: Option<(u32, u32)>) -> Option<&String> {
+    /// The topics that can play a role, the best first, beside the color image `chosen`.
+    fn ranked(
+        &self,
+        role: Role,
+        chosen: &BTreeMap<Role, String>,
+        color_size: Option<(u32, u32)>,
+    ) -> Vec<&String> {
+        let color = chosen.get(&Role::Color).map(String::as_str);
+        let depths: Vec<&str> = match role {
+            Role::Color => self.playing(Role::Depth, color_size).map(|(_, name)| &**name).collect(),
+            _ => Vec::new(),
+        };
+        let observed = &self.observed;
+        let preference = |name: &str, rank: u32| match role {
+            Role::Color | Role::Right => topics::color(observed, name, rank, &depths),
+            Role::Depth => topics::depth(observed, name, rank, color),
+            Role::Truth => topics::truth(observed, name, rank),
+            _ => topics::imu(observed, name, rank, color),
+        };
+        let mut ranked: Vec<_> = self
+            .playing(role, color_size)
+            .map(|(rank, name)| (preference(name, rank), name))
+            .collect();
+        ranked.sort();
+        ranked.into_iter().map(|(_, name)| name).collect()
+    }
+
+    /// The topics that can play a role and how well what they hold suits it.
+    fn playing(
+        &self,
+        role: Role,
+        color_size: Option<(u32, u32)>,
+    ) -> impl Iterator<Item = (u32, &String)> {
         let usage = |topic: &Topic| topic.image.as_ref().map(|image| image.usage);
         let has_depth = self.topics.values().any(|topic| usage(topic) == Some(ImageUsage::Depth));
         // What may be either is depth unless something else is.
-        let is_open = |topic: &Topic| {
+        let is_open = move |topic: &Topic| {
             has_depth || role != Role::Color || usage(topic) != Some(ImageUsage::GreyOrDepth)
         };
-        let topics = self.topics.iter().filter(|(_, topic)| is_open(topic));
-        let ranked = topics.filter_map(|(name, topic)| {
+        let topics = self.topics.iter().filter(move |(_, topic)| is_open(topic));
+        topics.filter_map(move |(name, topic)| {
             topic.rank(name, role, color_size).map(|rank| (rank, name))
-        });
-        ranked.min().map(|(_, name)| name)
+        })
+    }
+
+    /// What was chosen and what else there is, a line for each role left open.
+    pub fn choices(&self, chosen: &BTreeMap<Role, String>, config: &LogConfig) -> Vec<String> {
+        let open = chosen.iter().filter(|(role, _)| role.configured(config).is_empty());
+        let line = |(role, topic): (&Role, &String)| {
+            let others = self.alternatives(*role, chosen);
+            let others = match others.is_empty() {
+                true => String::new(),
+                false => format!("; not {} (log.{})", others.join(", "), role.setting()),
+            };
+            format!("{}: {}{others}", role.name(), self.with_rate(topic))
+        };
+        open.map(line).collect()
+    }
+
+    /// The other topics that could play a role, with their rates.
+    fn alternatives(&self, role: Role, chosen: &BTreeMap<Role, String>) -> Vec<String> {
+        let color = chosen.get(&Role::Color).and_then(|name| self.topics.get(name));
+        let size = color.and_then(Topic::size);
+        let others = self.ranked(role, chosen, size).into_iter();
+        others
+            .filter(|name| !chosen.values().any(|used| used == *name))
+            .map(|name| self.with_rate(name))
+            .collect()
+    }
+
+    fn with_rate(&self, topic: &str) -> String {
+        match self.observed.rate(topic) {
+            Some(rate) => format!("{topic} ({rate:.3} Hz)"),
+            None => topic.to_owned(),
+        }
     }
 
     fn config_name(&self) -> &str {
@@ -467,7 +563,7 @@ impl Survey {
             && is("/imu", Role::Imu);
         // The same topics may come from a log that was converted to SI units.
         let in_g = self.topics.get("/imu").is_some_and(Topic::logs_g);
-        if layout && in_g { "vcu_rvi" } else { "sim" }
+        if layout && in_g { "vcu_rvi" } else { "generic" }
     }
 
     /// Chooses a topic for each role; `Err` names the first that is configured but not there.
@@ -481,7 +577,7 @@ impl Survey {
                 "" if role == Role::Depth && has_right => None,
                 "" if role == Role::Right => self.partner(config, &chosen, color_size),
                 "" if role == Role::Accelerometer => self.other_half(&chosen),
-                "" => self.best(role, color_size),
+                "" => self.ranked(role, &chosen, color_size).first().copied(),
                 wanted => Some(self.configured(role, wanted).ok_or(role)?),
             };
             if let Some(name) = name {
@@ -561,7 +657,7 @@ impl Survey {
         for (role, wanted) in wanted {
             let name = match wanted.as_str() {
                 "none" => None,
-                "" => self.best(role, None),
+                "" => self.ranked(role, &chosen, None).first().copied(),
                 wanted => Some(self.configured(role, wanted).ok_or(role)?),
             };
             chosen.extend(name.map(|name| (role, name.clone())));
@@ -590,12 +686,11 @@ impl Survey {
         }
         let encoding = |topic: &Topic| topic.image.as_ref().map(|image| image.encoding.clone());
         let color_encoding = encoding(self.topics.get(color)?);
-        let is_like_color = |name: &String, topic: &Topic| {
-            name != color
-                && encoding(topic) == color_encoding
-                && topic.rank(name, Role::Right, color_size).is_some()
+        let is_like_color = |name: &&String| {
+            *name != color
+                && self.topics.get(*name).is_some_and(|topic| encoding(topic) == color_encoding)
         };
-        self.topics.iter().find(|(name, topic)| is_like_color(name, topic)).map(|(name, _)| name)
+        self.ranked(Role::Right, chosen, color_size).into_iter().find(is_like_color)
     }
 
     /// The two cameras, where depth comes from them.
@@ -622,8 +717,8 @@ impl Survey {
     }
 
     /// Without the demand that the log be complete.
-    pub fn summary(&self, kind: &str) -> LogSummary {
-        let chosen = self.choose(&LogConfig::default()).unwrap_or_default();
+    pub fn summary(&self, kind: &str, config: &LogConfig) -> LogSummary {
+        let chosen = self.choose(config).unwrap_or_default();
         self.summary_of(kind, &chosen, None)
     }
 
@@ -682,6 +777,38 @@ impl Survey {
                 .collect(),
             frames: None,
             camera: rig.map(StereoRig::camera).or(self.camera.as_ref()).cloned(),
+            calibration: self.calibration(chosen),
+            others: chosen
+                .keys()
+                .map(|role| (role.key().to_owned(), self.alternatives(*role, chosen)))
+                .filter(|(_, others)| !others.is_empty())
+                .collect(),
         }
+    }
+
+    /// What the log tells of the calibration of the chosen topics.
+    fn calibration(&self, chosen: &BTreeMap<Role, String>) -> FoundCalibration {
+        let topic = |role| chosen.get(&role).map(String::as_str);
+        let color = topic(Role::Color);
+        let streams = Streams {
+            color,
+            color_size: color.and_then(|name| self.topics.get(name)?.size()),
+            depth: topic(Role::Depth),
+            depth_size: topic(Role::Depth).and_then(|name| self.topics.get(name)?.size()),
+            right: topic(Role::Right),
+            imu: topic(Role::Imu),
+            truth: topic(Role::Truth),
+        };
+        let mut found = self.observed.settings(&streams);
+        let in_g =
+            topic(Role::Imu).filter(|name| self.topics.get(*name).is_some_and(Topic::logs_g));
+        // A shipped configuration knows the unit.
+        if let Some(name) = in_g.filter(|_| self.config_name() == "generic") {
+            let source = format!("readings of {name} have the size of 1 g");
+            let gravity = ImuConfig::default().gravity;
+            let setting = FoundSetting::from_log("imu.accelerometer_scale", gravity, &source);
+            found.settings.push(setting);
+        }
+        found
     }
 }

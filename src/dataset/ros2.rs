@@ -4,7 +4,7 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
 use serde::{Serialize, Serializer};
 
 use super::message::MessageType;
-use crate::sensor::{CameraConfig, ColorImage, Stamp};
+use crate::sensor::{CameraConfig, CameraModel, ColorImage, Stamp};
 
 #[derive(Serialize)]
 pub struct Header {
@@ -139,14 +139,29 @@ pub struct CameraInfo {
 }
 
 impl CameraInfo {
-    pub fn new(header: Header, camera: &CameraConfig, image: &ColorImage) -> Self {
+    /// `model` is the name under which radial-tangential distortion is told, and its number of
+    /// coefficients; those that the camera does not have are zero.
+    pub fn new(
+        header: Header,
+        camera: &CameraConfig,
+        image: &ColorImage,
+        (model, coefficients): (&'static str, usize),
+    ) -> Self {
         let CameraConfig { fx, fy, cx, cy, .. } = *camera;
+        let mut d = camera.distortion.clone();
+        let model = match camera.model {
+            CameraModel::RadialTangential => {
+                d.resize(coefficients, 0.0);
+                model
+            }
+            other => distortion_model(other),
+        };
         Self {
             header,
             height: image.height() as u32,
             width: image.width() as u32,
-            distortion_model: "plumb_bob",
-            d: camera.distortion.to_vec(),
+            distortion_model: model,
+            d,
             k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
             r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
             p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
@@ -160,6 +175,15 @@ impl CameraInfo {
                 do_rectify: false,
             },
         }
+    }
+}
+
+/// `sensor_msgs/distortion_models`; the models that it lacks by their own names.
+fn distortion_model(model: CameraModel) -> &'static str {
+    match model {
+        CameraModel::RadialTangential => "plumb_bob",
+        CameraModel::Rational => "rational_polynomial",
+        other => other.name(),
     }
 }
 

@@ -8,6 +8,7 @@ use nalgebra::{Isometry3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
 use super::definition::CDR_HEADER;
+use super::layout::{Layout, Names};
 use super::output::McapOutput;
 use super::ros2;
 use super::{Event, RgbdFrame, TruthPose};
@@ -36,6 +37,10 @@ pub struct LogWriterOptions {
     pub compression_level: u32,
     /// Log time minus header stamp, s.
     pub log_time_offset: f64,
+    /// Topics, frames and encodings: `"own"`, or `"d435i"`, `"oak-d"`, `"zed"`, `"azure-kinect"`,
+    /// `"structure-core"` as the drivers of these devices have them, the calibration only in
+    /// CameraInfo and transforms.
+    pub layout: Layout,
     /// Name of the shipped configuration that fits the sensors, noted in the log; empty: none.
     #[serde(skip)]
     pub configuration: String,
@@ -47,6 +52,7 @@ impl Default for LogWriterOptions {
             quirks: Quirks::None,
             compression_level: 1,
             log_time_offset: 0.0,
+            layout: Layout::Own,
             configuration: String::new(),
         }
     }
@@ -73,22 +79,16 @@ pub struct WriteSummary {
     pub truth_poses: u64,
 }
 
-const COLOR: &str = "/cam0/color";
-const DEPTH: &str = "/cam0/depth";
-const CAMERA_INFO: &str = "/cam0/camera_info";
-const IMU: &str = "/imu";
 const TRUTH: &str = "/truth/pose";
 const TRANSFORM: &str = "/tf";
 const STATIC_TRANSFORM: &str = "/tf_static";
 
-/// Keys of the metadata of the channel [`CAMERA_INFO`]: the name of a shipped configuration that
+/// Keys of the metadata of the channel of calibrations: the name of a shipped configuration that
 /// fits, and the camera's calibration with its mounting, as JSON.
 pub(super) const CONFIGURATION: &str = "mfg-vio:configuration";
 pub(super) const CAMERA: &str = "mfg-vio:camera";
 
 const WORLD_FRAME: &str = "world";
-const BODY_FRAME: &str = "imu";
-const CAMERA_FRAME: &str = "camera";
 
 /// Writes a log message by message; what has been given is out of memory after each chunk of a
 /// few megabytes. Without [`LogWriter::finish`] the file has no index.
@@ -96,6 +96,7 @@ pub struct LogWriter {
     path: PathBuf,
     output: McapOutput,
     options: LogWriterOptions,
+    names: Names,
     camera: Option<CameraConfig>,
     channels: BTreeMap<&'static str, u16>,
     summary: WriteSummary,
@@ -107,6 +108,7 @@ impl LogWriter {
         Ok(Self {
             path: path.to_owned(),
             output: McapOutput::create(path, options.compression_level)?,
+            names: options.layout.names(),
             options,
             camera: None,
             channels: BTreeMap::new(),
@@ -126,7 +128,22 @@ impl LogWriter {
             });
         };
         self.camera = Some(camera.clone());
-        self.transform(STATIC_TRANSFORM, stamp, [BODY_FRAME, CAMERA_FRAME], &body_from_camera)
+        self.mounting(&body_from_camera, STATIC_TRANSFORM, stamp)
+    }
+
+    /// Writes those transforms of the mounting that go out on `topic`.
+    fn mounting(
+        &mut self,
+        body_from_camera: &Isometry3<f64>,
+        topic: &'static str,
+        stamp: Stamp,
+    ) -> Result<(), WriteError> {
+        for ((frames, transform), is_repeated) in self.names.mounting(body_from_camera) {
+            if is_repeated == (topic == TRANSFORM) {
+                self.transform(topic, stamp, frames, &transform)?;
+            }
+        }
+        Ok(())
     }
 
     pub fn imu(&mut self, sample: &ImuSample) -> Result<(), WriteError> {
@@ -138,7 +155,7 @@ impl LogWriter {
         let mut no_orientation = [0.0; 9];
         no_orientation[0] = -1.0;
         let message = ros2::Imu {
-            header: ros2::Header::new(sample.stamp, BODY_FRAME),
+            header: ros2::Header::new(sample.stamp, self.names.imu_frame),
             orientation: UnitQuaternion::identity().into(),
             orientation_covariance: no_orientation,
             angular_velocity: sample.angular_velocity.into(),
@@ -147,21 +164,32 @@ impl LogWriter {
             linear_acceleration_covariance: [0.0; 9],
         };
         self.summary.imu_samples += 1;
-        self.write(IMU, sample.stamp, &message)
+        self.write(self.names.imu, sample.stamp, &message)
     }
 
     /// Writes color and depth under the same stamp; depth that is logged in other units than
     /// millimetres as floating-point metres.
     pub fn frame(&mut self, frame: &RgbdFrame) -> Result<(), WriteError> {
-        if let Some(camera) = &self.camera {
-            let header = ros2::Header::new(frame.stamp, CAMERA_FRAME);
-            let message = ros2::CameraInfo::new(header, camera, &frame.color);
-            self.write(CAMERA_INFO, frame.stamp, &message)?;
-        }
+        self.calibration(frame)?;
         self.color(frame.stamp, &frame.color)?;
         self.depth(frame.stamp, &frame.depth)?;
         self.summary.frames += 1;
         Ok(())
+    }
+
+    /// Writes what goes with a frame of the calibration, where it is known.
+    fn calibration(&mut self, frame: &RgbdFrame) -> Result<(), WriteError> {
+        let Some(camera) = self.camera.clone() else { return Ok(()) };
+        let Names { color_info, depth_info, camera_frame, model, imu_on_tf, .. } = self.names;
+        for topic in [Some(color_info), depth_info].into_iter().flatten() {
+            let header = ros2::Header::new(frame.stamp, camera_frame);
+            let message = ros2::CameraInfo::new(header, &camera, &frame.color, model);
+            self.write(topic, frame.stamp, &message)?;
+        }
+        match camera.imu_from_camera() {
+            Some(mounting) if imu_on_tf => self.mounting(&mounting, TRANSFORM, frame.stamp),
+            _ => Ok(()),
+        }
     }
 
     /// Writes a pose, and the same as a transform, by which viewers place the camera.
@@ -172,7 +200,7 @@ impl LogWriter {
         };
         self.summary.truth_poses += 1;
         self.write(TRUTH, pose.stamp, &message)?;
-        let frames = [WORLD_FRAME, BODY_FRAME];
+        let frames = [WORLD_FRAME, self.names.imu_frame];
         self.transform(TRANSFORM, pose.stamp, frames, &pose.world_from_body)
     }
 
@@ -207,8 +235,8 @@ impl LogWriter {
     }
 
     fn color(&mut self, stamp: Stamp, image: &ColorImage) -> Result<(), WriteError> {
-        let channels = image.format().channels();
         let swapped;
+        let encoded = self.names.color_format.encode(image.format(), image.data());
         let (encoding, data) = match (image.format(), self.options.quirks) {
             (PixelFormat::Mono8, _) => ("mono8", image.data()),
             (PixelFormat::Bgr8, Quirks::VcuRvi) => ("8UC3", image.data()),
@@ -216,41 +244,48 @@ impl LogWriter {
                 swapped = swap_red_and_blue(image.data());
                 ("8UC3", swapped.as_slice())
             }
-            (PixelFormat::Rgb8, Quirks::None) => ("rgb8", image.data()),
-            (PixelFormat::Bgr8, Quirks::None) => ("bgr8", image.data()),
+            (format, Quirks::None) => match (&encoded, format) {
+                (Some((encoding, data)), _) => (*encoding, data.as_slice()),
+                (None, PixelFormat::Bgr8) => ("bgr8", image.data()),
+                (None, _) => ("rgb8", image.data()),
+            },
         };
-        let message = ros2::Image {
-            header: ros2::Header::new(stamp, CAMERA_FRAME),
-            height: image.height() as u32,
-            width: image.width() as u32,
-            encoding,
-            is_bigendian: 0,
-            step: (image.width() * channels) as u32,
-            data: ros2::Bytes(data),
-        };
-        self.write(COLOR, stamp, &message)
+        let size = (image.width() as u32, image.height() as u32);
+        self.image(self.names.color, stamp, size, (encoding, data))
     }
 
     fn depth(&mut self, stamp: Stamp, image: &DepthImage) -> Result<(), WriteError> {
         let in_millimetres = (f64::from(image.scale()) * 1000.0 - 1.0).abs() < 1e-6;
         let values = image.data().iter();
-        let (encoding, size, data): (_, _, Vec<u8>) = match in_millimetres {
-            true => ("16UC1", 2, values.flat_map(|raw| raw.to_le_bytes()).collect()),
+        let (encoding, data): (_, Vec<u8>) = match in_millimetres && !self.names.depth_in_metres {
+            true => ("16UC1", values.flat_map(|raw| raw.to_le_bytes()).collect()),
             false => {
                 let metres = |raw: &u16| (f32::from(*raw) * image.scale()).to_le_bytes();
-                ("32FC1", 4, values.flat_map(metres).collect())
+                ("32FC1", values.flat_map(metres).collect())
             }
         };
+        let size = (image.width() as u32, image.height() as u32);
+        self.image(self.names.depth, stamp, size, (encoding, &data))
+    }
+
+    fn image(
+        &mut self,
+        topic: &'static str,
+        stamp: Stamp,
+        (width, height): (u32, u32),
+        (encoding, data): (&'static str, &[u8]),
+    ) -> Result<(), WriteError> {
         let message = ros2::Image {
-            header: ros2::Header::new(stamp, CAMERA_FRAME),
-            height: image.height() as u32,
-            width: image.width() as u32,
+            header: ros2::Header::new(stamp, self.names.camera_frame),
+            height,
+            width,
             encoding,
             is_bigendian: 0,
-            step: size * image.width() as u32,
-            data: ros2::Bytes(&data),
+            // Without padding.
+            step: (data.len() / height.max(1) as usize) as u32,
+            data: ros2::Bytes(data),
         };
-        self.write(DEPTH, stamp, &message)
+        self.write(topic, stamp, &message)
     }
 
     fn write<M: Serialize>(
@@ -273,15 +308,18 @@ impl LogWriter {
         if let Some(id) = self.channels.get(topic) {
             return Ok(*id);
         }
+        let names = self.names;
+        let is_calibration = topic == names.color_info || Some(topic) == names.depth_info;
         let schema = match topic {
-            IMU => ("sensor_msgs/msg/Imu", ros2::IMU_DEFINITION),
-            CAMERA_INFO => ("sensor_msgs/msg/CameraInfo", ros2::CAMERA_INFO_DEFINITION),
+            _ if topic == names.imu => ("sensor_msgs/msg/Imu", ros2::IMU_DEFINITION),
+            _ if is_calibration => ("sensor_msgs/msg/CameraInfo", ros2::CAMERA_INFO_DEFINITION),
             TRUTH => ("geometry_msgs/msg/PoseStamped", ros2::POSE_DEFINITION),
             TRANSFORM | STATIC_TRANSFORM => ("tf2_msgs/msg/TFMessage", ros2::TF_DEFINITION),
             _ => ("sensor_msgs/msg/Image", ros2::IMAGE_DEFINITION),
         };
         let mut metadata = BTreeMap::new();
-        if topic == CAMERA_INFO {
+        // Other recorders leave no notes.
+        if topic == names.color_info && self.options.layout == Layout::Own {
             let camera = self.camera.as_ref().and_then(|c| serde_json::to_string(c).ok());
             metadata.extend(camera.map(|camera| (CAMERA.to_owned(), camera)));
             let configuration = &self.options.configuration;
@@ -374,13 +412,13 @@ mod tests {
         expected.extend([6, 0, 0, 0]);
         expected.extend([6, 0, 0, 0]);
         expected.extend([1, 2, 3, 4, 5, 6]);
-        assert_eq!(body(&messages, COLOR), expected);
+        assert_eq!(body(&messages, "/cam0/color"), expected);
     }
 
     #[test]
     fn depth_in_millimetres_is_written_so_and_other_depth_in_metres() {
         let messages = written(LogWriterOptions::default());
-        let depth = body(&messages, DEPTH);
+        let depth = body(&messages, "/cam0/depth");
         assert!(depth.windows(6).any(|w| w == b"32FC1\0"));
         let metres = &depth[depth.len() - 8..];
         assert_eq!(metres, [1_f32.to_le_bytes(), 0_f32.to_le_bytes()].concat());
@@ -392,7 +430,7 @@ mod tests {
         log.frame(&RgbdFrame { depth, ..frame() }).unwrap();
         log.finish().unwrap();
         let messages = super::tests::messages(&path);
-        let depth = body(&messages, DEPTH);
+        let depth = body(&messages, "/cam0/depth");
         assert!(depth.windows(6).any(|w| w == b"16UC1\0"));
         assert_eq!(depth[depth.len() - 4..], [232, 3, 0, 0]);
     }
@@ -420,7 +458,7 @@ mod tests {
     fn quirks_change_units_and_encoding() {
         // Of an Imu message, the last 72 bytes are a covariance and the 8 before them az.
         let force = |messages: &[(String, String, Vec<u8>)]| {
-            let imu = body(messages, IMU);
+            let imu = body(messages, "/imu");
             float(imu, imu.len() - 80)
         };
         let plain = written(LogWriterOptions::default());
@@ -428,7 +466,7 @@ mod tests {
         let quirky = LogWriterOptions { quirks: Quirks::VcuRvi, ..LogWriterOptions::default() };
         let quirky = written(quirky);
         assert!((force(&quirky) + 1.0).abs() < 1e-12);
-        let color = body(&quirky, COLOR);
+        let color = body(&quirky, "/cam0/color");
         assert!(color.windows(5).any(|w| w == b"8UC3\0"));
         assert_eq!(color[color.len() - 6..], [3, 2, 1, 6, 5, 4]);
     }

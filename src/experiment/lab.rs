@@ -22,7 +22,7 @@ use crate::filter::{
 };
 use crate::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator, block};
 use crate::map::MapConfig;
-use crate::sensor::{ImuSample, PinholeCamera, Stamp};
+use crate::sensor::{Camera, ImuSample, Stamp};
 use crate::simulation::{BodyState, ImuSimulator, Motion, MotionConfig, SceneConfig, SceneError};
 use crate::vision::{DepthReading, PointMeasurement};
 
@@ -195,7 +195,7 @@ fn sightings(
     world_from_camera: &Isometry3<f64>,
     rng: &mut ChaCha8Rng,
 ) -> Vec<(usize, PointMeasurement)> {
-    let camera = PinholeCamera::from(&scene.camera);
+    let camera = Camera::pinhole(scene.camera.intrinsics());
     let mut seen = Vec::new();
     for (landmark, position) in landmarks.iter().enumerate() {
         let exact = world_from_camera.inverse_transform_point(&Point3::from(*position)).coords;
@@ -213,7 +213,8 @@ fn sightings(
         let standard_deviation = scene.depth.standard_deviation(exact.z);
         let depth = exact.z + standard_deviation * noise.z;
         let reading = DepthReading { depth, slope: Vector2::zeros(), standard_deviation };
-        seen.push((landmark, PointMeasurement::new(&camera, pixel, lab.pixel_sd, &reading)));
+        let measured = PointMeasurement::new(&camera, pixel, lab.pixel_sd, &reading);
+        seen.extend(measured.map(|measured| (landmark, measured)));
     }
     seen
 }

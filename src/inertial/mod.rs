@@ -8,6 +8,7 @@ mod imu;
 mod initial;
 mod noise;
 mod propagation;
+mod sensor_class;
 mod state;
 
 pub use clipping::{Clipped, ClippingMonitor};
@@ -21,4 +22,5 @@ pub use initial::{InitialAttitude, StandstillCheck, StandstillConfig, attitude_f
 pub(crate) use noise::DrivingNoise;
 pub(crate) use propagation::symmetrize;
 pub use propagation::{MotionModel, Propagator};
+pub use sensor_class::{INFLATION, SensorClass};
 pub use state::{Belief, NavCovariance, NavState, block, pose_covariance};

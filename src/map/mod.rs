@@ -7,7 +7,7 @@ mod point;
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::sensor::PinholeCamera;
+use crate::sensor::Camera;
 use frustum::Frustum;
 use index::SpatialIndex;
 
@@ -194,7 +194,7 @@ impl Map {
     pub fn candidates(
         &self,
         world_from_camera: &Isometry3<f64>,
-        camera: &PinholeCamera,
+        camera: &Camera,
         width: usize,
         height: usize,
     ) -> Vec<u64> {
@@ -234,11 +234,13 @@ fn direction(from: &Vector3<f64>, to: &Vector3<f64>) -> Option<Vector3<f64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sensor::PinholeCamera;
     use crate::vision::Descriptor;
     use nalgebra::UnitQuaternion;
     use proptest::prelude::*;
 
-    const CAMERA: PinholeCamera = PinholeCamera { fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 };
+    const PINHOLE: PinholeCamera = PinholeCamera { fx: 500.0, fy: 500.0, cx: 320.0, cy: 240.0 };
+    const CAMERA: Camera = Camera::pinhole(PINHOLE);
 
     fn descriptor(byte: u8) -> Descriptor {
         Descriptor::from_bytes(&[byte; 32])
@@ -283,7 +285,7 @@ mod tests {
     fn points_outside_the_image_and_its_margin_are_left_out() {
         let pixels = [(-19.0, 240.0), (-22.0, 240.0), (658.0, 240.0), (661.0, 240.0)];
         let pixels = pixels.into_iter().chain([(320.0, -19.0), (320.0, -22.0), (320.0, 501.0)]);
-        let at = |(x, y)| CAMERA.unproject(nalgebra::Point2::new(x, y), 2.0);
+        let at = |(x, y)| PINHOLE.unproject(nalgebra::Point2::new(x, y), 2.0);
         let mut points: Vec<_> = pixels.map(at).collect();
         points.push(Vector3::z() * -2.0);
         assert_eq!(from(&map_of(&points), &Isometry3::identity()), [0, 2, 4]);

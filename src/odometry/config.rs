@@ -5,7 +5,7 @@ use crate::fault::FaultConfig;
 use crate::filter::FilterConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
-use crate::sensor::{CameraConfig, PinholeCamera};
+use crate::sensor::{Camera, CameraConfig, CameraError};
 use crate::tracking::{SearchConfig, TrackingConfig};
 use crate::vision::{DepthConfig, MatchingConfig, PatchConfig, RansacConfig};
 use serde::{Deserialize, Serialize};
@@ -31,9 +31,12 @@ pub struct OdometryConfig {
 
 impl OdometryConfig {
     /// The part that tracking depends on.
-    pub fn tracking(&self) -> TrackingConfig {
-        TrackingConfig {
-            pinhole: PinholeCamera::from(&self.camera),
+    ///
+    /// # Errors
+    /// See [`CameraConfig::validate`].
+    pub fn tracking(&self) -> Result<TrackingConfig, CameraError> {
+        Ok(TrackingConfig {
+            lens: Camera::new(&self.camera)?.with_depth(self.depth.along),
             camera: self.camera.clone(),
             depth: self.depth.clone(),
             search: self.search.clone(),
@@ -42,6 +45,6 @@ impl OdometryConfig {
             ransac: self.ransac.clone(),
             measurement_inflation: self.filter.measurement_inflation,
             proven_observations: self.filter.state_min_observations,
-        }
+        })
     }
 }

@@ -73,8 +73,7 @@ impl OdometryStats {
 }
 
 impl Odometry {
-    /// `None` if `camera.imu_from_camera` is no rigid
-    /// motion.
+    /// `None` if `camera` is no possible calibration or its mounting no rigid motion.
     pub fn new(
         config: &OdometryConfig,
         kind: FilterKind,
@@ -93,7 +92,7 @@ impl Odometry {
         };
         Some(Self {
             config: config.clone(),
-            tracking: config.tracking(),
+            tracking: config.tracking().ok()?,
             kind,
             seed,
             body_from_camera,

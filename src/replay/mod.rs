@@ -8,6 +8,8 @@ mod metrics;
 mod navigation;
 mod outputs;
 mod report;
+#[cfg(feature = "vision")]
+mod trial;
 
 use std::iter::Peekable;
 use std::path::{Path, PathBuf};
@@ -23,6 +25,8 @@ pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
 pub use outputs::{RESULTS, state_columns};
 pub use report::{Series, figures, report};
+#[cfg(feature = "vision")]
+pub use trial::{Tried, try_out};
 
 use crate::config::Config;
 use crate::dataset::{self, Fault, Log, LogSummary, ReadReport};
@@ -92,6 +96,11 @@ impl Replayed {
     /// The reference, its clock corrected by `truth.time_offset`; `None` where there is none.
     pub fn reference(&self) -> Option<&Trajectory> {
         self.reference.as_ref()
+    }
+
+    /// The estimated poses of the body.
+    pub fn trajectory(&self) -> &[TruthPose] {
+        &self.estimate
     }
 
     /// Whether stamps increase, poses are finite and covariances positive definite.

@@ -13,7 +13,7 @@ mod imu;
 mod magnetic;
 mod stamp;
 
-pub use camera::{CameraConfig, PinholeCamera};
+pub use camera::{Camera, CameraConfig, CameraError, CameraModel, DepthAlong, PinholeCamera};
 pub use event::{Event, Stream, TruthPose};
 pub use frame::RgbdFrame;
 pub use geodesy::{Datum, Geodetic};

@@ -8,7 +8,7 @@ use super::render::{DropoutConfig, ImageConfig};
 use super::trajectory::{TrajectoryConfig, TrajectoryError};
 use super::world::{PeopleConfig, RoomConfig};
 use crate::dataset::LogWriterOptions;
-use crate::sensor::CameraConfig;
+use crate::sensor::{Camera, CameraConfig, CameraError};
 use crate::vision::DepthConfig;
 
 /// A scene: the world, the motion through it and the sensors. The defaults are a lab room and
@@ -27,7 +27,8 @@ pub struct SceneConfig {
     pub light: LightConfig,
     pub motion: MotionConfig,
     pub trajectory: TrajectoryConfig,
-    /// Intrinsics and mounting of the camera; distortion is not simulated and must be zero.
+    /// Model, intrinsics and mounting of the camera. Depth of wide lenses is the range along the ray
+    /// (`depth.along`).
     pub camera: CameraConfig,
     pub image: ImageConfig,
     /// Range and noise of the depth sensor. Where neighbours differ by more than `edge_fraction`,
@@ -162,6 +163,8 @@ pub enum SceneError {
     TooLong { wanted: f64, available: f64 },
     #[error("scene: the path needs a room of {size:.1?} m; at most {limit} m a side are possible")]
     PathTooWide { size: [f64; 3], limit: f64 },
+    #[error("scene: camera.{0}")]
+    Camera(#[from] CameraError),
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),
 }
@@ -193,6 +196,11 @@ impl SceneConfig {
         scene.try_into().map_err(line)
     }
 
+    /// The camera, with depth as it is written.
+    pub fn lens(&self) -> Result<Camera, SceneError> {
+        Ok(Camera::new(&self.camera)?.with_depth(self.depth.along))
+    }
+
     /// Checks values that no type can; returns the camera's pose in the body frame.
     pub fn validate(&self) -> Result<Isometry3<f64>, SceneError> {
         let positive = [
@@ -200,8 +208,6 @@ impl SceneConfig {
             ("trajectory.cutoff", self.trajectory.cutoff),
             ("trajectory.height", self.trajectory.height),
             ("image.rate", self.image.rate),
-            ("camera.fx", self.camera.fx),
-            ("camera.fy", self.camera.fy),
             ("imu.rate", self.imu.rate),
             ("imu.gravity", self.imu.gravity),
             ("room.texel", self.room.texel),
@@ -277,9 +283,7 @@ impl SceneConfig {
         let up = self.trajectory.up;
         let finite = up.iter().all(|x| x.is_finite());
         require(finite, "trajectory.up", format!("{up:?}"), "must be finite")?;
-        let straight = self.camera.distortion == [0.0; 5];
-        let distortion = format!("{:?}", self.camera.distortion);
-        require(straight, "camera.distortion", distortion, "is not simulated; set it to zeros")?;
+        self.lens()?;
         self.camera.imu_from_camera().ok_or_else(|| SceneError::Value {
             key: "camera.imu_from_camera",
             value: format!("{:?}", self.camera.imu_from_camera),
@@ -388,7 +392,8 @@ mod tests {
             ("[image]\nwidth = 0", "image.width"),
             ("[light]\nkeys = [[2, 1], [1, 0]]", "light.keys"),
             ("[room]\nsize = [1e9, 5, 3]", "room.size"),
-            ("[camera]\ndistortion = [0.1, 0, 0, 0, 0]", "camera.distortion"),
+            ("[camera]\nmodel = \"equidistant\"\ndistortion = [0.1]", "camera.distortion"),
+            ("[camera]\nfx = -1.0", "camera.fx"),
         ] {
             let error = SceneConfig::from_toml(text).unwrap().validate().unwrap_err();
             assert!(error.to_string().contains(key), "{error}");

@@ -3,6 +3,7 @@
 mod config;
 mod inertial;
 mod landmarks;
+mod lens;
 mod motion;
 mod render;
 mod sensors;

@@ -8,8 +8,9 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use statrs::function::erf::erf_inv;
 
-use super::world::{Solid, View, World};
-use crate::sensor::{ColorImage, DepthImage, PinholeCamera, PixelFormat};
+use super::lens::Lens;
+use super::world::{Hit, Solid, View, World};
+use crate::sensor::{Camera, ColorImage, DepthImage, PinholeCamera, PixelFormat};
 use crate::vision::DepthConfig;
 
 /// The color image.
@@ -94,8 +95,8 @@ const TILE: usize = 16;
 #[derive(Debug, Clone, Copy, Default)]
 struct Sample {
     color: [f32; 3],
-    /// Along the optical axis, m.
-    depth: f32,
+    /// In lengths of the ray's direction.
+    distance: f32,
     /// Identifies box and face.
     surface: u32,
     /// Cosine of incidence.
@@ -106,38 +107,63 @@ struct Sample {
 struct Scene<'a> {
     world: &'a World,
     views: Vec<View>,
-    /// Smallest rectangle of pixels that contains each box: left, top, right, bottom.
-    bounds: Vec<[f32; 4]>,
-    /// No point of a box is at less depth than this, m.
+    bounds: Vec<Bounds>,
+    /// No point of a box is nearer than this, in lengths of a ray's direction.
     nearest: Vec<f32>,
     /// Boxes by [`Self::nearest`], the room last.
     order: Vec<usize>,
-    camera: Lens,
+    lens: &'a Lens,
 }
 
+/// Where in the image a box may be seen.
 #[derive(Debug, Clone, Copy)]
-struct Lens {
-    center: [f32; 2],
-    /// Size of a pixel in normalized image coordinates.
-    pixel: [f32; 2],
+enum Bounds {
+    Nowhere,
+    Everywhere,
+    /// Left, top, right, bottom, pixels.
+    Rectangle([f32; 4]),
+    Cone(Cone),
 }
 
-impl Lens {
-    fn direction(&self, column: f32, row: f32) -> (f32, f32) {
-        ((column - self.center[0]) * self.pixel[0], (row - self.center[1]) * self.pixel[1])
+/// Directions within an angle of an axis.
+#[derive(Debug, Clone, Copy)]
+struct Cone {
+    /// Unit vector, camera coordinates.
+    axis: Vector3<f32>,
+    /// Of the angle, which is below 90 degrees.
+    cosine: f32,
+    sine: f32,
+}
+
+impl Cone {
+    fn new(axis: Vector3<f32>, cosine: f32) -> Self {
+        Self { axis, cosine, sine: (1.0 - cosine * cosine).max(0.0).sqrt() }
+    }
+
+    /// Around a box; `None` from within its sphere.
+    fn around(solid: &Solid, camera_from_world: &Isometry3<f32>) -> Option<Self> {
+        let center = solid.world_from_box.translation.vector.into();
+        let center = camera_from_world.transform_point(&center).coords;
+        let sine = solid.half.norm() / center.norm();
+        (sine < 1.0).then(|| Self::new(center.normalize(), (1.0 - sine * sine).sqrt()))
+    }
+
+    fn meets(&self, other: &Self) -> bool {
+        let apart = self.cosine * other.cosine - self.sine * other.sine;
+        self.axis.dot(&other.axis) >= apart
     }
 }
 
 impl Scene<'_> {
     #[inline]
     fn trace(&self, column: f32, row: f32, candidates: &[usize]) -> Sample {
-        let (x, y) = self.camera.direction(column, row);
-        let mut nearest: Option<(usize, super::world::Hit)> = None;
+        let Some(ray) = self.lens.ray(column, row) else { return Sample::default() };
+        let mut nearest: Option<(usize, Hit)> = None;
         for &index in candidates {
             if nearest.is_some_and(|(_, hit)| hit.distance < self.nearest[index]) {
                 continue;
             }
-            let hit = self.world.solids[index].hit_in_view(&self.views[index], x, y, NEAR);
+            let hit = self.world.solids[index].hit_in_view(&self.views[index], &ray, NEAR);
             if let Some(hit) = hit.filter(|h| nearest.is_none_or(|(_, n)| h.distance < n.distance))
             {
                 nearest = Some((index, hit));
@@ -146,28 +172,47 @@ impl Scene<'_> {
         let Some((index, hit)) = nearest else { return Sample::default() };
         let (solid, view) = (&self.world.solids[index], &self.views[index]);
         Sample {
-            color: solid.color(view, hit, x, y, self.camera.pixel, &self.world.grain),
-            depth: hit.distance,
+            color: solid.color(view, hit, &ray, &self.world.grain),
+            distance: hit.distance,
             surface: (8 * index + hit.face + 1) as u32,
-            cosine: Solid::incidence(view, hit, x, y),
+            cosine: Solid::incidence(view, hit, &ray),
         }
+    }
+
+    /// Around what is seen between two corners of the image, a pixel more on each side; `None` if
+    /// part of it is not imaged.
+    fn cone(&self, left: f32, top: f32, right: f32, bottom: f32) -> Option<Cone> {
+        let direction = |x, y| Some(self.lens.ray(x, y)?.direction.normalize());
+        let axis = direction(0.5 * (left + right), 0.5 * (top + bottom))?;
+        let mut cosine = 1.0_f32;
+        for x in [left - 1.0, right + 1.0] {
+            for y in [top - 1.0, bottom + 1.0] {
+                cosine = cosine.min(axis.dot(&direction(x, y)?));
+            }
+        }
+        (cosine > 0.0).then(|| Cone::new(axis, cosine))
     }
 
     /// Boxes that may be seen between two corners of the image.
     fn candidates(&self, left: f32, top: f32, right: f32, bottom: f32, list: &mut Vec<usize>) {
-        let is_inside = |index: &usize| {
-            let b = &self.bounds[*index];
-            b[0] <= right && b[2] >= left && b[1] <= bottom && b[3] >= top
+        let cone = if self.lens.is_pinhole() { None } else { self.cone(left, top, right, bottom) };
+        let is_inside = |index: &usize| match &self.bounds[*index] {
+            Bounds::Nowhere => false,
+            Bounds::Everywhere => true,
+            Bounds::Rectangle(b) => b[0] <= right && b[2] >= left && b[1] <= bottom && b[3] >= top,
+            Bounds::Cone(bounds) => cone.is_none_or(|cone| cone.meets(bounds)),
         };
         list.clear();
         list.extend(self.order.iter().copied().filter(is_inside));
     }
 }
 
-/// Renders frames of one world with one sensor; the same frame number gives the same noise.
+/// Renders frames of one world with a camera of any model; the same frame number gives the same
+/// noise.
 pub struct Renderer {
     world: World,
-    camera: PinholeCamera,
+    camera: Camera,
+    lens: Lens,
     image: ImageConfig,
     depth: DepthConfig,
     dropout: DropoutConfig,
@@ -180,7 +225,7 @@ pub struct Renderer {
 impl Renderer {
     pub fn new(
         world: World,
-        camera: PinholeCamera,
+        camera: Camera,
         image: ImageConfig,
         depth: DepthConfig,
         dropout: DropoutConfig,
@@ -190,6 +235,7 @@ impl Renderer {
         Self {
             world,
             camera,
+            lens: Lens::new(&camera, image.width, image.height),
             image,
             depth,
             dropout,
@@ -200,7 +246,8 @@ impl Renderer {
         }
     }
 
-    /// Color and depth (mm) of one shot; `None` if the image is empty.
+    /// Color and depth (mm; `z`, or the range where the camera measures that) of one shot; `None` if
+    /// the image is empty.
     pub fn render(&mut self, shot: &Shot) -> Option<(ColorImage, DepthImage)> {
         let (width, height) = (self.image.width, self.image.height);
         self.world.advance(shot.time);
@@ -219,7 +266,7 @@ impl Renderer {
             |(row, (color, depth))| {
                 let mut noise = self.noise.clone();
                 noise.set_stream(shot.frame * height as u64 + row as u64);
-                let blur = Blur::new(&scene.camera, shot, self.image.shutter);
+                let blur = Blur::new(&self.lens, shot, self.image.shutter);
                 let film = Film { samples: &samples, colors: &colors, blur, light: shot.light };
                 self.expose(&film, row, noise, color, depth);
             },
@@ -266,46 +313,45 @@ impl Renderer {
     fn scene(&self, world_from_camera: &Isometry3<f64>) -> Scene<'_> {
         let pose: Isometry3<f32> = world_from_camera.cast();
         let camera_from_world = pose.inverse();
-        let views = self.world.solids.iter().map(|solid| solid.view(&pose)).collect();
+        let views: Vec<View> = self.world.solids.iter().map(|solid| solid.view(&pose)).collect();
         let bounds =
             self.world.solids.iter().map(|solid| self.bounds(solid, &camera_from_world)).collect();
-        let nearest: Vec<f32> = self
-            .world
-            .solids
-            .iter()
-            .map(|solid| nearest_depth(solid, &camera_from_world))
-            .collect();
+        let nearest = |(solid, view): (&Solid, &View)| match self.lens.is_pinhole() {
+            true => nearest_depth(solid, &camera_from_world),
+            false => nearest_range(solid, view),
+        };
+        let nearest: Vec<f32> = self.world.solids.iter().zip(&views).map(nearest).collect();
         let key = |index: &usize| (self.world.solids[*index].inside_out, nearest[*index]);
         let mut order: Vec<usize> = (0..nearest.len()).collect();
         order.sort_by(|a, b| {
             let ((room_a, depth_a), (room_b, depth_b)) = (key(a), key(b));
             room_a.cmp(&room_b).then(depth_a.total_cmp(&depth_b))
         });
-        let camera = Lens {
-            center: [self.camera.cx as f32, self.camera.cy as f32],
-            pixel: [1.0 / self.camera.fx as f32, 1.0 / self.camera.fy as f32],
-        };
-        Scene { world: &self.world, views, bounds, nearest, order, camera }
+        Scene { world: &self.world, views, bounds, nearest, order, lens: &self.lens }
     }
 
-    fn bounds(&self, solid: &Solid, camera_from_world: &Isometry3<f32>) -> [f32; 4] {
-        const ALL: [f32; 4] = [f32::MIN, f32::MIN, f32::MAX, f32::MAX];
-        const NONE: [f32; 4] = [f32::MAX, f32::MAX, f32::MIN, f32::MIN];
+    fn bounds(&self, solid: &Solid, camera_from_world: &Isometry3<f32>) -> Bounds {
+        const EMPTY: [f32; 4] = [f32::MAX, f32::MAX, f32::MIN, f32::MIN];
         if solid.inside_out {
-            return ALL;
+            return Bounds::Everywhere;
         }
+        if !self.lens.is_pinhole() {
+            let cone = Cone::around(solid, camera_from_world);
+            return cone.map_or(Bounds::Everywhere, Bounds::Cone);
+        }
+        let PinholeCamera { fx, fy, cx, cy } = *self.camera.intrinsics();
         let corners = solid.corners().map(|c| camera_from_world * nalgebra::Point3::from(c));
         if corners.iter().all(|c| c.z <= NEAR) {
-            return NONE;
+            return Bounds::Nowhere;
         }
         if corners.iter().any(|c| c.z <= NEAR) {
-            return ALL;
+            return Bounds::Everywhere;
         }
-        corners.iter().fold(NONE, |b, c| {
-            let x = c.x / c.z * self.camera.fx as f32 + self.camera.cx as f32;
-            let y = c.y / c.z * self.camera.fy as f32 + self.camera.cy as f32;
+        Bounds::Rectangle(corners.iter().fold(EMPTY, |b, c| {
+            let x = c.x / c.z * fx as f32 + cx as f32;
+            let y = c.y / c.z * fy as f32 + cy as f32;
             [b[0].min(x - 1.0), b[1].min(y - 1.0), b[2].max(x + 1.0), b[3].max(y + 1.0)]
-        })
+        }))
     }
 
     /// Turns one row into pixel values.
@@ -324,7 +370,7 @@ impl Renderer {
         let corner = (middle[0] * middle[0] + middle[1] * middle[1]).max(1.0);
         for column in 0..width {
             let (sample, around) = self.neighbours(film.samples, column, row);
-            let value = film.blurred(width, height, column, row, sample.depth);
+            let value = film.blurred(width, height, column, row, sample.distance);
             let (x, y) = (column as f32 - middle[0], row as f32 - middle[1]);
             let light = 1.0 - self.image.vignetting as f32 * (x * x + y * y) / corner;
             let factor = gain * light.max(0.0).sqrt();
@@ -333,22 +379,32 @@ impl Renderer {
                 let grain = sd * self.quantile(random >> (12 * k));
                 color[3 * column + k] = (value * factor + grain + 0.5).clamp(0.0, 255.0) as u8;
             }
-            depth[column] = self.measured_depth(sample, &around, random >> 36);
+            let truth = self
+                .lens
+                .ray(column as f32, row as f32)
+                .map_or(0.0, |ray| self.lens.depth(&ray, sample.distance));
+            depth[column] = self.measured_depth(truth, sample, &around, random >> 36);
         }
     }
 
-    /// Depth in mm from 28 random bits; 0 where there is none.
-    fn measured_depth(&self, sample: &Sample, around: &[&Sample; 4], random: u64) -> u16 {
+    /// Depth in mm of a sample at depth `truth` (m) from 28 random bits; 0 where there is none.
+    fn measured_depth(
+        &self,
+        truth: f32,
+        sample: &Sample,
+        around: &[&Sample; 4],
+        random: u64,
+    ) -> u16 {
         let chance = ((random >> 12) & 0xffff) as f64 / 65536.0;
-        let step = self.depth.edge_fraction as f32 * sample.depth;
+        let step = self.depth.edge_fraction as f32 * sample.distance;
         let edge = around
             .iter()
-            .any(|s| s.surface != sample.surface && (s.depth - sample.depth).abs() > step);
+            .any(|s| s.surface != sample.surface && (s.distance - sample.distance).abs() > step);
         let lost = if edge { self.dropout.edges } else { self.dropout.anywhere };
         if chance < lost || f64::from(sample.cosine) < self.dropout.grazing_cosine {
             return 0;
         }
-        let truth = f64::from(sample.depth);
+        let truth = f64::from(truth);
         let sigma = self.depth.standard_deviation(truth);
         let measured = truth + sigma * f64::from(self.quantile(random));
         let usable = measured >= self.depth.min && measured <= self.depth.max;
@@ -381,6 +437,12 @@ fn nearest_depth(solid: &Solid, camera_from_world: &Isometry3<f32>) -> f32 {
     solid.corners().map(depth).into_iter().fold(f32::MAX, f32::min) - ROUNDING
 }
 
+/// Distance of a box, less what rounding may make of it.
+fn nearest_range(solid: &Solid, view: &View) -> f32 {
+    const ROUNDING: f32 = 1e-3;
+    if solid.inside_out { f32::MIN } else { solid.distance(view) - ROUNDING }
+}
+
 fn trace_band(scene: &Scene, first_row: usize, width: usize, samples: &mut [Sample]) {
     let rows = samples.len() / width;
     let mut candidates = Vec::new();
@@ -409,28 +471,24 @@ fn supersampled(scene: &Scene, x: f32, y: f32, candidates: &[usize]) -> [f32; 3]
 
 /// Speed of image points, as far as the camera's motion makes it.
 #[derive(Debug, Clone, Copy)]
-struct Blur {
-    lens: Lens,
+struct Blur<'a> {
+    lens: &'a Lens,
     /// Displacement of the camera while the shutter is open, m and rad.
     shift: Vector3<f32>,
     turn: Vector3<f32>,
 }
 
-impl Blur {
-    fn new(lens: &Lens, shot: &Shot, shutter: f64) -> Self {
+impl<'a> Blur<'a> {
+    fn new(lens: &'a Lens, shot: &Shot, shutter: f64) -> Self {
         let scaled = |v: Vector3<f64>| (v * shutter).cast::<f32>();
-        Self { lens: *lens, shift: scaled(shot.velocity), turn: scaled(shot.angular_velocity) }
+        Self { lens, shift: scaled(shot.velocity), turn: scaled(shot.angular_velocity) }
     }
 
     /// How far the point seen at a pixel moves while the shutter is open, pixels.
-    fn path(&self, column: f32, row: f32, depth: f32) -> [f32; 2] {
-        let (x, y) = self.lens.direction(column, row);
-        let point = Vector3::new(x, y, 1.0);
-        let change = -self.shift / depth.max(NEAR) - self.turn.cross(&point);
-        [
-            (change.x - x * change.z) / self.lens.pixel[0],
-            (change.y - y * change.z) / self.lens.pixel[1],
-        ]
+    fn path(&self, column: f32, row: f32, distance: f32) -> [f32; 2] {
+        let Some(ray) = self.lens.ray(column, row) else { return [0.0; 2] };
+        let change = -self.shift / distance.max(NEAR) - self.turn.cross(&ray.direction);
+        self.lens.motion(&ray, &change)
     }
 }
 
@@ -438,7 +496,7 @@ impl Blur {
 struct Film<'a> {
     samples: &'a [Sample],
     colors: &'a [[f32; 3]],
-    blur: Blur,
+    blur: Blur<'a>,
     /// Factor on the light in the room.
     light: f64,
 }
@@ -477,7 +535,7 @@ mod tests {
     fn renderer(noise: f64) -> Renderer {
         let room = RoomConfig { clutter: 4, ..small_room() };
         let world = World::furnished(&room, &PeopleConfig::default(), &[Vector3::zeros()], &[], 1);
-        let camera = PinholeCamera { fx: 120.0, fy: 120.0, cx: 79.5, cy: 59.5 };
+        let camera = Camera::pinhole(PinholeCamera { fx: 120.0, fy: 120.0, cx: 79.5, cy: 59.5 });
         let image = ImageConfig { width: 160, height: 120, noise, ..ImageConfig::default() };
         Renderer::new(world, camera, image, DepthConfig::default(), DropoutConfig::default(), 7)
     }

@@ -11,7 +11,7 @@ use super::render::{Renderer, Shot};
 use super::texture::Picture;
 use super::world::{RoomConfig, World};
 use crate::dataset::{LogWriter, WriteError, WriteSummary};
-use crate::sensor::{Event, PinholeCamera, RgbdFrame, Stamp, TruthPose};
+use crate::sensor::{Event, RgbdFrame, Stamp, TruthPose};
 
 /// Runs through a scene and yields what its sensors see, ordered by stamp.
 pub struct Simulation {
@@ -88,9 +88,10 @@ impl Simulation {
         config.room.size = room_around(&config.room, &path)?;
         let pictures = pictures(&config.room)?;
         let world = World::furnished(&config.room, &config.people, &path, &pictures, seed(2));
+        let camera = config.lens()?;
         let renderer = Renderer::new(
             world,
-            PinholeCamera::from(&config.camera),
+            camera,
             config.image.clone(),
             config.depth.clone(),
             config.dropout.clone(),
@@ -254,7 +255,7 @@ mod tests {
     use nalgebra::{Matrix2, Point2, Vector2};
 
     use super::*;
-    use crate::sensor::ColorImage;
+    use crate::sensor::{CameraModel, ColorImage};
     use crate::vision::DepthConfig;
 
     /// A quarter-size camera in a small room, without noise.
@@ -343,20 +344,33 @@ mod tests {
     /// within half a pixel, at the same depth, within two sigma.
     #[test]
     fn truth_carries_pixels_from_frame_to_frame() {
-        let scene = small_scene();
+        carries(&small_scene());
+    }
+
+    /// The same with a view of 180 degrees, whose depth is the range.
+    #[test]
+    fn truth_carries_pixels_of_a_fisheye() {
+        let mut scene = small_scene();
+        scene.camera.model = CameraModel::Equidistant;
+        scene.camera.distortion = vec![0.0035, 0.0007, -0.002, 0.0002];
+        (scene.camera.fx, scene.camera.fy) = (51.0, 51.0);
+        carries(&scene);
+    }
+
+    fn carries(scene: &SceneConfig) {
         let simulation = Simulation::new(scene.clone()).unwrap();
-        let frames = frames(&scene);
+        let frames = frames(scene);
         let (first, later) = (&frames[20], &frames[23]);
         let mount = scene.camera.imu_from_camera().unwrap();
         let pose = |frame: &RgbdFrame| simulation.state(frame.stamp).world_from_body * mount;
         let later_from_first = pose(later).inv_mul(&pose(first));
         assert!(later_from_first.translation.vector.norm() > 0.03);
-        let camera = PinholeCamera::from(&scene.camera);
+        let camera = scene.lens().unwrap();
         let law: &DepthConfig = &scene.depth;
         let carry = |pixel: Point2<f64>| {
             let depth = law.read(&first.depth, pixel)?.depth;
-            let point = later_from_first * nalgebra::Point3::from(camera.unproject(pixel, depth));
-            Some((camera.project(&point.coords)?, point.z))
+            let point = later_from_first * nalgebra::Point3::from(camera.unproject(pixel, depth)?);
+            Some((camera.project(&point.coords)?, camera.depth_of(&point.coords)))
         };
         let (mut depths, mut deep) = (0, 0);
         let mut shifts = Vec::new();

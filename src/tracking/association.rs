@@ -8,7 +8,7 @@ use nalgebra::{Isometry3, Matrix2, Matrix3, Point2, Point3, Vector2, Vector3};
 use super::shutter::Shutter;
 use super::view::{FrontEndFrame, View};
 use crate::map::{MapPoint, ReferenceView};
-use crate::sensor::PinholeCamera;
+use crate::sensor::Camera;
 use crate::vision::ransac::{Consensus, Reprojection};
 use crate::vision::{Correspondence, DepthReading, Feature, PointMeasurement};
 
@@ -65,7 +65,8 @@ pub fn place(
     world_from_camera: &Isometry3<f64>,
     view: &View,
 ) -> Option<Placed> {
-    let predicted = world_from_camera.inverse_transform_point(&Point3::from(point.position)).z;
+    let in_camera = world_from_camera.inverse_transform_point(&Point3::from(point.position));
+    let predicted = view.camera.depth_of(&in_camera.coords);
     let direction_only =
         DepthReading { depth: predicted, slope: Vector2::zeros(), standard_deviation: predicted };
     let depth = match feature.depth {
@@ -75,7 +76,7 @@ pub fn place(
     };
     align(feature, &depth, point, world_from_camera, view).or_else(|| {
         let (shift, sigma) = (Vector2::zeros(), feature.pixel_sigma);
-        let measurement = feature.measurement_with(&depth, view.camera, shift, sigma);
+        let measurement = feature.measurement_with(&depth, view.camera, shift, sigma)?;
         let measurement = view.at_stamp(feature.pixel, measurement);
         Some(Placed { measurement, renews_reference: true })
     })
@@ -101,7 +102,7 @@ fn align(
     let sigma = config.pixel_sigma * feature.scale;
     let shift = found.shift * feature.scale;
     let change = warp.determinant().abs().sqrt();
-    let measurement = feature.measurement_with(depth, view.camera, shift, sigma);
+    let measurement = feature.measurement_with(depth, view.camera, shift, sigma)?;
     Some(Placed {
         measurement: view.at_stamp(feature.pixel, measurement),
         renews_reference: change.max(change.recip()) > config.max_scale_change,
@@ -121,12 +122,13 @@ pub fn seek(
     let position = Point3::from(point.position);
     let in_camera = world_from_camera.inverse_transform_point(&position).coords;
     let predicted = view.project(&in_camera)?;
-    let then = reference.world_from_camera.inverse_transform_point(&position).z;
-    let as_taken = view.config.camera.distort(predicted);
-    let glimpse = front.extraction.pyramid.look(as_taken, reference.scale * then / in_camera.z)?;
+    let then = reference.world_from_camera.inverse_transform_point(&position).coords;
+    let nearer = view.camera.depth_of(&then) / view.camera.depth_of(&in_camera);
+    let glimpse = front.extraction.pyramid.look(predicted, reference.scale * nearer)?;
     let depth = view.config.depth.read(&front.frame.depth, glimpse.pixel)?;
     let feature = Feature {
-        pixel: predicted + (glimpse.pixel - as_taken),
+        pixel: glimpse.pixel,
+        bearing: view.camera.bearing(glimpse.pixel)?,
         descriptor: point.descriptor,
         response: 0.0,
         octave: glimpse.octave,
@@ -151,13 +153,14 @@ fn warp(
     feature: &Feature,
     depth: &DepthReading,
     world_from_camera: &Isometry3<f64>,
-    camera: &PinholeCamera,
+    camera: &Camera,
 ) -> Option<Matrix2<f64>> {
     /// Of the order of the window that is compared, pixels of the level.
     const STEP: f64 = 4.0;
     let reference_from_camera = reference.world_from_camera.inv_mul(world_from_camera);
     let seen = |offset: Vector2<f64>| {
-        let at = camera.unproject(feature.pixel + offset, depth.depth + depth.slope.dot(&offset));
+        let depth = depth.depth + depth.slope.dot(&offset);
+        let at = camera.unproject(feature.pixel + offset, depth)?;
         camera.project(&(reference_from_camera * Point3::from(at)).coords)
     };
     let column = |axis: Vector2<f64>| {
@@ -204,7 +207,7 @@ mod tests {
     use super::*;
     use crate::map::{Map, MapConfig, Sighting};
     use crate::odometry::OdometryConfig;
-    use crate::sensor::{ColorImage, DepthImage, PixelFormat, RgbdFrame, Stamp};
+    use crate::sensor::{ColorImage, DepthImage, PinholeCamera, PixelFormat, RgbdFrame, Stamp};
     use crate::vision::{Descriptor, Extraction, Pyramid};
     use nalgebra::UnitQuaternion;
 
@@ -254,10 +257,11 @@ mod tests {
             camera: crate::sensor::CameraConfig { fx, fy, cx, cy, ..config.camera },
             ..config
         }
-        .tracking();
+        .tracking()
+        .unwrap();
         let view = View {
             config: &config,
-            camera: &camera,
+            camera: &Camera::pinhole(camera),
             body_from_camera: Isometry3::identity(),
             size: SIZE,
             shutter: Shutter::default(),

@@ -1,6 +1,6 @@
 use serde::{Deserialize, Serialize};
 
-use crate::sensor::{CameraConfig, PinholeCamera};
+use crate::sensor::{Camera, CameraConfig};
 use crate::vision::{DepthConfig, MatchingConfig, PatchConfig, RansacConfig};
 
 /// Where in the image a map point is looked for.
@@ -36,7 +36,7 @@ impl Default for SearchConfig {
 /// The settings that tracking depends on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackingConfig {
-    pub pinhole: PinholeCamera,
+    pub lens: Camera,
     pub camera: CameraConfig,
     pub depth: DepthConfig,
     pub search: SearchConfig,

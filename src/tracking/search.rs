@@ -157,7 +157,7 @@ impl FrameTracker<'_> {
         let by_pose = crate::filter::point_by_pose(rotation.matrix(), &in_body);
         let spread =
             by_pose * pose_covariance(&belief.covariance) * by_pose.transpose() + point.covariance;
-        let sigma = self.view.camera.fx * spread.trace().max(0.0).sqrt() / in_camera.z;
+        let sigma = self.view.camera.pixels_across(spread.trace().max(0.0).sqrt(), &in_camera);
         let likely = (search.min_radius + 3.0 * sigma).min(search.max_radius);
         let radius = radius.unwrap_or(likely);
         Some(crate::vision::Prediction { descriptor: point.descriptor, pixel, radius })

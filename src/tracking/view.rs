@@ -5,7 +5,7 @@ use nalgebra::{Isometry3, Point2, Vector3};
 use super::config::TrackingConfig;
 use super::shutter::{Shutter, given_pose};
 use crate::inertial::Belief;
-use crate::sensor::{PinholeCamera, RgbdFrame};
+use crate::sensor::{Camera, RgbdFrame};
 use crate::vision::{Extraction, PointMeasurement};
 
 /// A frame after the front end.
@@ -64,7 +64,7 @@ impl Prediction {
 #[derive(Debug, Clone, Copy)]
 pub struct View<'a> {
     pub config: &'a TrackingConfig,
-    pub camera: &'a PinholeCamera,
+    pub camera: &'a Camera,
     pub body_from_camera: Isometry3<f64>,
     pub size: (usize, usize),
     pub shutter: Shutter,
@@ -80,17 +80,17 @@ impl<'a> View<'a> {
         size: (usize, usize),
         seed: u64,
     ) -> Self {
-        let (camera, body_from_camera) = (&config.pinhole, prediction.body_from_camera);
+        let (camera, body_from_camera) = (&config.lens, prediction.body_from_camera);
         let shutter = prediction.shutter(config, size.1, None);
         Self { config, camera, body_from_camera, size, shutter, seed }
     }
 
-    /// Row of the image that shows what is at an undistorted `pixel`.
+    /// Row of the image that shows what is at `pixel`.
     pub fn row(&self, pixel: Point2<f64>) -> f64 {
-        self.config.camera.distort(pixel).y.clamp(0.0, self.size.1 as f64)
+        pixel.y.clamp(0.0, self.size.1 as f64)
     }
 
-    /// Undistorted pixel at which a point is seen that is at `in_camera` (m) at the stamp.
+    /// Pixel at which a point is seen that is at `in_camera` (m) at the stamp.
     pub fn project(&self, in_camera: &Vector3<f64>) -> Option<Point2<f64>> {
         let pixel = self.camera.project(in_camera)?;
         self.camera.project(&self.shutter.at_row(in_camera, self.row(pixel)))

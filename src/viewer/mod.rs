@@ -35,6 +35,8 @@ mod config;
 #[cfg(feature = "viewer")]
 mod covariance;
 #[cfg(feature = "viewer")]
+mod display;
+#[cfg(feature = "viewer")]
 mod error;
 #[cfg(feature = "viewer")]
 mod image;

@@ -11,6 +11,7 @@ use rerun::sink::{FileSink, FileSinkError, GrpcSink, GrpcSinkConnectionState, Lo
 use rerun::{RecordingStream, RecordingStreamBuilder, SpawnError, SpawnOptions};
 
 use super::config::is_due;
+use super::display::Display;
 use super::keypoints::{self, Tracks};
 use super::map::{self, MapLog};
 use super::plots::{Moment, PlotLog};
@@ -19,7 +20,7 @@ use super::sphere::Sphere;
 use super::timeline::{Clock, FRAME, TIME};
 use super::{Contents, RecordingConfig, ViewerError, belief, blueprint, image, plots};
 use crate::odometry::StepReport;
-use crate::sensor::{ColorImage, DepthImage, ImuSample, PinholeCamera, RgbdFrame, Stamp};
+use crate::sensor::{Camera, ColorImage, DepthImage, ImuSample, RgbdFrame, Stamp};
 
 /// Viewers keep the layout that a user has arranged by the application's name.
 pub(super) const APPLICATION: &str = "mfg-vio";
@@ -65,7 +66,7 @@ pub struct Recorder {
 
 #[derive(Debug)]
 enum Message {
-    Camera { camera: PinholeCamera, imu_from_camera: Isometry3<f64>, size: [usize; 2] },
+    Camera { camera: Box<Camera>, imu_from_camera: Isometry3<f64>, size: [usize; 2] },
     Frame(Box<Frame>),
 }
 
@@ -119,13 +120,8 @@ impl Recorder {
     }
 
     /// Intrinsics, mounting and image size (columns, rows) of the camera; once, before any frame.
-    pub fn camera(
-        &mut self,
-        camera: &PinholeCamera,
-        imu_from_camera: &Isometry3<f64>,
-        size: [usize; 2],
-    ) {
-        let (camera, imu_from_camera) = (*camera, *imu_from_camera);
+    pub fn camera(&mut self, camera: &Camera, imu_from_camera: &Isometry3<f64>, size: [usize; 2]) {
+        let (camera, imu_from_camera) = (Box::new(*camera), *imu_from_camera);
         self.send(Message::Camera { camera, imu_from_camera, size });
     }
 
@@ -292,6 +288,8 @@ struct Writer {
     stream: RecordingStream,
     jpeg_quality: u8,
     truth: bool,
+    /// For cameras that are no pinholes.
+    display: Option<Display>,
     clock: Option<Clock>,
     scene: Scene,
     map: MapLog,
@@ -324,6 +322,7 @@ impl Writer {
             stream,
             jpeg_quality: config.jpeg_quality,
             truth: contents.truth,
+            display: None,
             clock: None,
             scene: Scene::default(),
             map: MapLog::new(config.map_color, config.map_ellipsoids),
@@ -343,7 +342,9 @@ impl Writer {
         for message in receiver {
             let result = match message {
                 Message::Camera { camera, imu_from_camera, size } => {
-                    scene::log_camera(&self.stream, &camera, &imu_from_camera, size, self.truth)
+                    self.display = Display::new(&camera, size);
+                    let shown = self.display.as_ref().map_or(*camera, Display::camera);
+                    scene::log_camera(&self.stream, &shown, &imu_from_camera, size, self.truth)
                         .map_err(ViewerError::from)
                 }
                 Message::Frame(frame) => self.log_frame(&frame),
@@ -381,12 +382,28 @@ impl Writer {
             self.plots.flush(&self.stream, clock)?;
         }
         scene::log_notes(&self.stream, &report.notes)?;
+        self.log_images(report, color.as_ref(), depth.as_ref())
+    }
+
+    fn log_images(
+        &mut self,
+        report: &StepReport,
+        color: Option<&ColorImage>,
+        depth: Option<&DepthImage>,
+    ) -> Result<(), ViewerError> {
+        let display = self.display.as_ref();
         if let Some(color) = color {
+            let shown = display.and_then(|display| display.color(color));
+            let color = shown.as_ref().unwrap_or(color);
             let encoded = image::color(color, self.jpeg_quality, report.frame)?;
             self.stream.log(scene::COLOR, &encoded)?;
-            keypoints::log(&self.stream, &report.keypoints, &mut self.tracks)?;
+            let shown = display.map(|display| display.keypoints(&report.keypoints));
+            let keypoints = shown.as_ref().unwrap_or(&report.keypoints);
+            keypoints::log(&self.stream, keypoints, &mut self.tracks)?;
         }
         if let Some(depth) = depth {
+            let shown = display.and_then(|display| display.depth(depth));
+            let depth = shown.as_ref().unwrap_or(depth);
             self.stream.log(scene::DEPTH, &image::depth(depth, report.frame)?)?;
         }
         Ok(())

@@ -10,7 +10,7 @@ use rerun::{
 use super::covariance::{diagonal_block, principal_axes};
 use crate::inertial::block;
 use crate::odometry::{Note, NoteLevel, StepReport};
-use crate::sensor::PinholeCamera;
+use crate::sensor::{Camera, PinholeCamera};
 
 pub(super) const WORLD: &str = "world";
 pub(super) const IMAGE: &str = "world/estimate/body/camera/image";
@@ -62,12 +62,13 @@ pub(super) fn log_styles(stream: &RecordingStream) -> RecordingStreamResult<()> 
 
 pub(super) fn log_camera(
     stream: &RecordingStream,
-    camera: &PinholeCamera,
+    camera: &Camera,
     imu_from_camera: &Isometry3<f64>,
     [width, height]: [usize; 2],
     truth: bool,
 ) -> RecordingStreamResult<()> {
-    let [fx, fy, cx, cy] = [camera.fx, camera.fy, camera.cx, camera.cy].map(|x| x as f32);
+    let PinholeCamera { fx, fy, cx, cy } = *camera.intrinsics();
+    let [fx, fy, cx, cy] = [fx, fy, cx, cy].map(|x| x as f32);
     // Rerun's pixel coordinates are those of the top left corner of a pixel, ours of its centre.
     let columns = [[fx, 0.0, 0.0], [0.0, fy, 0.0], [cx + 0.5, cy + 0.5, 1.0]];
     let pinhole = Pinhole::new(columns)

@@ -18,12 +18,13 @@ use crate::odometry::{
     KeypointRole, KeypointView, MapPointView, Note, StageTimes, StepCounts, StepReport,
 };
 use crate::sensor::{
-    ColorImage, DepthImage, ImuSample, PinholeCamera, PixelFormat, RgbdFrame, Stamp,
+    Camera, ColorImage, DepthImage, ImuSample, PinholeCamera, PixelFormat, RgbdFrame, Stamp,
 };
 use crate::so3::ProperSvd;
 
 const SIZE: [usize; 2] = [320, 240];
-const CAMERA: PinholeCamera = PinholeCamera { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5 };
+const CAMERA: Camera =
+    Camera::pinhole(PinholeCamera { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5 });
 const RATE: f64 = 30.0;
 
 /// A walk around a room whose walls carry the map, with a slowly growing error.

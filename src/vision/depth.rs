@@ -1,7 +1,7 @@
 use nalgebra::{Matrix3, Point2, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::sensor::DepthImage;
+use crate::sensor::{DepthAlong, DepthImage};
 
 /// Half the side of the window that a surface is fitted to, pixels.
 const WINDOW_RADIUS: isize = 2;
@@ -15,6 +15,9 @@ const MIN_READINGS: usize = 13;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DepthConfig {
+    /// What the depth images hold: distance along the optical axis (`"axis"`), range along the ray
+    /// (`"ray"`), or the one usual for the camera's model (`"auto"`).
+    pub along: DepthAlong,
     /// Depths below this are not used, m.
     pub min: f64,
     /// Depths above this are not used, m.
@@ -33,6 +36,7 @@ impl Default for DepthConfig {
     /// The Kinect v1 law of Khoshelham and Elberink (2012): `1.425e-3 d^2` m.
     fn default() -> Self {
         Self {
+            along: DepthAlong::Auto,
             min: 0.4,
             max: 5.0,
             noise_floor: 1.0e-3,
@@ -56,7 +60,7 @@ impl DepthConfig {
 /// Depth at a point of the image, and how it changes around it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthReading {
-    /// Along the optical axis, m.
+    /// Along the optical axis or the ray, as the camera measures it, m.
     pub depth: f64,
     /// Change of depth by column and by row, m/pixel.
     pub slope: Vector2<f64>,
@@ -65,8 +69,8 @@ pub struct DepthReading {
 }
 
 impl DepthConfig {
-    /// Depth at `pixel` (of the image as taken, not undistorted), from a plane through the
-    /// readings around it; planes are linear in inverse depth.
+    /// Depth at `pixel`, from a plane through the readings around it; planes are linear in
+    /// inverse depth.
     ///
     /// The standard deviation is that of a single reading, because the errors of neighbours
     /// come from the same matching window and do not average out; where the surface is rougher

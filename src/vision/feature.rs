@@ -1,10 +1,10 @@
 use std::sync::Arc;
 
-use nalgebra::{Matrix3, Point2, Vector2, Vector3};
+use nalgebra::{Matrix3, Point2, UnitVector3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::{DepthReading, Patch, Pyramid};
-use crate::sensor::PinholeCamera;
+use crate::sensor::Camera;
 
 /// A 256-bit binary descriptor (ORB, BRIEF, ...).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -46,32 +46,37 @@ pub struct PointMeasurement {
 }
 
 impl PointMeasurement {
-    /// Point and covariance at an undistorted `pixel` known with `pixel_sigma` (px, each axis).
+    /// Point and covariance at a `pixel` known with `pixel_sigma` (px, each axis); `None` outside of
+    /// what the lens images.
     ///
-    /// A pixel error moves the point along the surface, not along a plane of constant depth:
-    /// `p(u, v) = z(u, v) (x, y, 1)`, so `dp/du = z (1/fx, 0, 0) + dz/du (x, y, 1)`.
+    /// A pixel error moves the point along the surface, not along one of constant depth:
+    /// `p(u, v) = d(u, v) r(u, v)` with depth `d` and `r` the point at depth 1, so
+    /// `dp/du = d dr/du + dd/du r`.
     pub fn new(
-        camera: &PinholeCamera,
+        camera: &Camera,
         pixel: Point2<f64>,
         pixel_sigma: f64,
         reading: &DepthReading,
-    ) -> Self {
-        let point = camera.unproject(pixel, reading.depth);
+    ) -> Option<Self> {
+        let point = camera.unproject(pixel, reading.depth)?;
         let ray = point / reading.depth;
-        let along_u = Vector3::x() * (reading.depth / camera.fx) + ray * reading.slope.x;
-        let along_v = Vector3::y() * (reading.depth / camera.fy) + ray * reading.slope.y;
+        let across = camera.across(&ray, reading.depth)?;
+        let along_u = across.column(0) + ray * reading.slope.x;
+        let along_v = across.column(1) + ray * reading.slope.y;
         let lateral = along_u * along_u.transpose() + along_v * along_v.transpose();
         let covariance = lateral * pixel_sigma.powi(2)
             + ray * ray.transpose() * reading.standard_deviation.powi(2);
-        Self { point, covariance }
+        Some(Self { point, covariance })
     }
 }
 
 /// A key point of one image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Feature {
-    /// Position in the undistorted image, pixels.
+    /// Position in the image as taken, pixels.
     pub pixel: Point2<f64>,
+    /// Direction in which the camera sees it, camera coordinates.
+    pub bearing: UnitVector3<f64>,
     pub descriptor: Descriptor,
     /// Strength of the corner: its FAST score, in grey levels.
     pub response: f32,
@@ -89,20 +94,21 @@ pub struct Feature {
 
 impl Feature {
     /// Where the feature is in space, as the detector placed it; `None` without depth.
-    pub fn measurement(&self, camera: &PinholeCamera) -> Option<PointMeasurement> {
+    pub fn measurement(&self, camera: &Camera) -> Option<PointMeasurement> {
         let depth = self.depth.as_ref()?;
-        Some(self.measurement_with(depth, camera, Vector2::zeros(), self.pixel_sigma))
+        self.measurement_with(depth, camera, Vector2::zeros(), self.pixel_sigma)
     }
 
     /// Where the feature is in space if it is really `shift` (px of the full image) beside
-    /// [`Self::pixel`], known with `pixel_sigma` (px), on the surface that `depth` describes.
+    /// [`Self::pixel`], known with `pixel_sigma` (px), on the surface that `depth` describes; `None`
+    /// outside of what the lens images.
     pub fn measurement_with(
         &self,
         depth: &DepthReading,
-        camera: &PinholeCamera,
+        camera: &Camera,
         shift: Vector2<f64>,
         pixel_sigma: f64,
-    ) -> PointMeasurement {
+    ) -> Option<PointMeasurement> {
         let moved = DepthReading { depth: depth.depth + depth.slope.dot(&shift), ..*depth };
         PointMeasurement::new(camera, self.pixel + shift, pixel_sigma, &moved)
     }
@@ -167,6 +173,7 @@ impl FeatureConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sensor::PinholeCamera;
     use nalgebra::Vector2;
     use proptest::prelude::*;
 
@@ -190,15 +197,16 @@ mod tests {
             u in 0.0..640.0f64, v in 0.0..480.0f64, depth in 0.5..5.0f64,
             slope_u in -0.01..0.01f64, slope_v in -0.01..0.01f64,
         ) {
-            let camera = PinholeCamera { fx: 517.0, fy: 516.0, cx: 318.0, cy: 255.0 };
+            let pinhole = PinholeCamera { fx: 517.0, fy: 516.0, cx: 318.0, cy: 255.0 };
+            let camera = Camera::pinhole(pinhole);
             let reading = DepthReading {
                 depth, slope: Vector2::new(slope_u, slope_v), standard_deviation: 0.01,
             };
             let sigma = 0.8;
-            let measured = PointMeasurement::new(&camera, Point2::new(u, v), sigma, &reading);
+            let measured = PointMeasurement::new(&camera, Point2::new(u, v), sigma, &reading).unwrap();
             let at = |du: f64, dv: f64, dz: f64| {
                 let z = depth + slope_u * du + slope_v * dv + dz;
-                camera.unproject(Point2::new(u + du, v + dv), z)
+                pinhole.unproject(Point2::new(u + du, v + dv), z)
             };
             let h = 1e-4;
             let columns = [

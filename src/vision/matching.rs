@@ -36,7 +36,7 @@ pub struct Match {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Prediction {
     pub descriptor: Descriptor,
-    /// Where it should appear in the undistorted image, pixels.
+    /// Where it should appear in the image, pixels.
     pub pixel: Point2<f64>,
     /// How far from there it is looked for, pixels.
     pub radius: f64,
@@ -234,6 +234,7 @@ mod tests {
         let pixel = Point2::new(x, y);
         Feature {
             pixel,
+            bearing: nalgebra::Vector3::z_axis(),
             descriptor,
             response: 1.0,
             octave: 0,

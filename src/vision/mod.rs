@@ -5,6 +5,7 @@
 
 mod depth;
 mod feature;
+mod mask;
 mod matching;
 #[cfg(feature = "vision")]
 mod orb;
@@ -18,6 +19,7 @@ mod stereo;
 
 pub use depth::{DepthConfig, DepthReading};
 pub use feature::{Descriptor, Extraction, Feature, FeatureConfig, PointMeasurement};
+pub use mask::{Mask, MaskConfig, MaskError};
 pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
 #[cfg(feature = "vision")]
 pub use orb::{OrbExtractor, VisionError};

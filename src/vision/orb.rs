@@ -4,19 +4,17 @@ use std::sync::Arc;
 
 use nalgebra::{Point2, Vector2};
 use opencv::boxed_ref::BoxedRef;
-use opencv::core::{
-    KeyPoint, Mat, Point2d, Ptr, Rect, Size, TermCriteria, TermCriteria_Type, Vec3b, Vector,
-};
+use opencv::core::{KeyPoint, Mat, Ptr, Rect, Size, Vec3b, Vector};
 use opencv::features2d::{
     FastFeatureDetector, FastFeatureDetector_DetectorType, KeyPointsFilter, ORB, ORB_ScoreType,
 };
+use opencv::imgproc;
 use opencv::prelude::*;
-use opencv::{calib3d, imgproc};
 
 use super::pyramid::full_pixel;
 use super::select::{Corner, spread};
-use super::{DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Patch, Pyramid};
-use crate::sensor::{CameraConfig, PinholeCamera, PixelFormat, RgbdFrame};
+use super::{DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Mask, Patch, Pyramid};
+use crate::sensor::{Camera, CameraConfig, CameraError, PixelFormat, RgbdFrame};
 
 /// Radius of the patch that orientation and descriptor are computed from, pixels of the level.
 const PATCH_RADIUS: usize = 15;
@@ -55,8 +53,15 @@ pub enum VisionError {
         color.0, color.1, depth.0, depth.1
     )]
     SizeMismatch { color: (usize, usize), depth: (usize, usize) },
+    #[error(
+        "the image of log.mask has {}x{} pixels, the color image {}x{}: it must be of that size",
+        mask.0, mask.1, color.0, color.1
+    )]
+    MaskSize { mask: (usize, usize), color: (usize, usize) },
     #[error("features.{key} = {value}: must be {expected}")]
     Config { key: &'static str, value: f64, expected: &'static str },
+    #[error("camera.{0}")]
+    Camera(#[from] CameraError),
     #[error("OpenCV: {0}")]
     OpenCv(#[from] opencv::Error),
 }
@@ -66,14 +71,14 @@ pub enum VisionError {
 /// OpenCV runs on one thread, so that results do not depend on the machine.
 pub struct OrbExtractor {
     config: FeatureConfig,
-    camera: CameraConfig,
-    pinhole: PinholeCamera,
+    camera: Camera,
     depth: DepthConfig,
     fast: Ptr<FastFeatureDetector>,
     /// With the lower threshold.
     sensitive: Ptr<FastFeatureDetector>,
     orb: Ptr<ORB>,
     keeps_pyramid: bool,
+    mask: Mask,
 }
 
 impl OrbExtractor {
@@ -108,14 +113,19 @@ impl OrbExtractor {
         )?;
         Ok(Self {
             config: config.clone(),
-            camera: camera.clone(),
-            pinhole: PinholeCamera::from(camera),
+            camera: Camera::new(camera)?,
             depth: depth.clone(),
             fast: detector(config.fast_threshold)?,
             sensitive: detector(config.min_fast_threshold.min(config.fast_threshold))?,
             orb,
             keeps_pyramid: false,
+            mask: Mask::default(),
         })
+    }
+
+    /// The same, that finds nothing in a part of the image.
+    pub fn masked(self, mask: Mask) -> Self {
+        Self { mask, ..self }
     }
 
     /// The same, that gives the pyramid with the features, to be looked at again.
@@ -130,11 +140,15 @@ impl OrbExtractor {
         if color != depth {
             return Err(VisionError::SizeMismatch { color, depth });
         }
+        if let Some(mask) = self.mask.size().filter(|mask| *mask != color) {
+            return Err(VisionError::MaskSize { mask, color });
+        }
         let pyramid = self.pyramid(frame)?;
         let mut corners = vec![];
         for (level, image) in pyramid.iter().enumerate() {
             self.detect(level as u8, image, color, &mut corners)?;
         }
+        corners.retain(|corner| !self.mask.covers(corner.pixel.x, corner.pixel.y));
         let (cell, spacing) = (self.config.cell_size, self.config.min_spacing);
         let corners = spread(corners, color.0, color.1, cell, spacing, self.config.max_features);
         let described = self.describe(&pyramid, &corners)?;
@@ -147,9 +161,25 @@ impl OrbExtractor {
         let mut pyramid = Pyramid::default();
         for (octave, level) in levels.iter().enumerate() {
             let scale = self.config.scale_factor.powi(octave as i32);
-            pyramid.push(level.data_bytes()?.to_vec(), level.cols() as usize, scale);
+            let (mut pixels, width) = (level.data_bytes()?.to_vec(), level.cols() as usize);
+            self.blank(&mut pixels, width, scale);
+            pyramid.push(pixels, width, scale);
         }
         Ok(pyramid)
+    }
+
+    /// Leaves nothing to be recognised in the masked part of a level.
+    fn blank(&self, pixels: &mut [u8], width: usize, scale: f64) {
+        if self.mask.is_empty() {
+            return;
+        }
+        for (index, pixel) in pixels.iter_mut().enumerate() {
+            let here = Point2::new((index % width) as f64, (index / width) as f64);
+            let full = full_pixel(here, Vector2::repeat(scale));
+            if self.mask.covers(full.x, full.y) {
+                *pixel = 0;
+            }
+        }
     }
 
     /// The grey image and its reductions, as far as a patch fits into them.
@@ -266,56 +296,24 @@ impl OrbExtractor {
         pyramid: &[Mat],
         described: &[(Corner, Descriptor)],
     ) -> Result<Vec<Feature>, VisionError> {
-        let pixels = self.undistort(described.iter().map(|(corner, _)| corner.pixel))?;
         let mut features = Vec::with_capacity(described.len());
-        for ((corner, descriptor), pixel) in described.iter().zip(pixels) {
+        for (corner, descriptor) in described {
+            // In the corners of the image a wide lens may show nothing.
+            let Some(bearing) = self.camera.bearing(corner.pixel) else { continue };
             features.push(Feature {
-                pixel,
+                pixel: corner.pixel,
+                bearing,
                 descriptor: *descriptor,
                 response: corner.score,
                 octave: corner.level,
                 scale: self.config.scale_factor.powi(i32::from(corner.level)),
                 pixel_sigma: self.config.pixel_sigma_at(corner.level),
                 patch: patch_around(pyramid, corner)?,
-                // Depth is registered to the color image as taken, hence looked up at that pixel.
                 depth: self.depth.read(&frame.depth, corner.pixel),
             });
         }
         Ok(features)
     }
-
-    /// Pixels of the same camera without distortion.
-    fn undistort(
-        &self,
-        pixels: impl Iterator<Item = Point2<f64>>,
-    ) -> Result<Vec<Point2<f64>>, VisionError> {
-        if self.camera.distortion == [0.0; 5] {
-            return Ok(pixels.collect());
-        }
-        let distorted: Vector<Point2d> = pixels.map(|p| Point2d::new(p.x, p.y)).collect();
-        if distorted.is_empty() {
-            return Ok(vec![]);
-        }
-        let PinholeCamera { fx, fy, cx, cy } = self.pinhole;
-        let matrix = Mat::from_slice_2d(&[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])?;
-        let mut undistorted = Vector::<Point2d>::new();
-        calib3d::undistort_points_iter(
-            &distorted,
-            &mut undistorted,
-            &matrix,
-            &Mat::from_slice(&self.camera.distortion)?,
-            &opencv::core::no_array(),
-            &matrix,
-            criteria(50, 1e-3)?,
-        )?;
-        Ok(undistorted.iter().map(|p| Point2::new(p.x, p.y)).collect())
-    }
-}
-
-/// Ends an iteration of OpenCV's.
-fn criteria(max_iterations: i32, epsilon: f64) -> Result<TermCriteria, VisionError> {
-    let kind = TermCriteria_Type::COUNT as i32 | TermCriteria_Type::EPS as i32;
-    Ok(TermCriteria::new(kind, max_iterations, epsilon)?)
 }
 
 fn check(
@@ -375,7 +373,9 @@ fn orientation(pixels: &[u8], stride: usize, corner: &Corner) -> f32 {
 mod tests {
     use super::*;
     use crate::sensor::{ColorImage, DepthImage, Stamp};
-    use crate::vision::{MatchingConfig, match_descriptors};
+    use crate::vision::{MaskConfig, MatchingConfig, match_descriptors};
+    use opencv::calib3d;
+    use opencv::core::{Point2d, TermCriteria, TermCriteria_Type};
     use rand::{Rng, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
@@ -426,6 +426,25 @@ mod tests {
             assert!((0.0..HEIGHT as f64).contains(&f.pixel.y));
             assert!((f.depth.unwrap().depth - 2.0).abs() < 1e-9);
         }
+    }
+
+    #[test]
+    fn nothing_is_found_in_the_masked_part() {
+        let image = frame(WIDTH, HEIGHT, collage(1));
+        let regions = MaskConfig::Regions(vec![[0, 160, 320, 80], [100, 0, 60, 240]]);
+        let mask = regions.load().unwrap();
+        let covered = |f: &&Feature| mask.covers(f.pixel.x, f.pixel.y);
+        assert!(features(&image).iter().filter(covered).count() > 50);
+        let mut masked = extractor().keeping_pyramid(true).masked(mask.clone());
+        let Extraction { features, pyramid } = masked.extract(&image).unwrap();
+        assert!(features.len() > 100);
+        assert_eq!(features.iter().filter(covered).count(), 0);
+        // Nor is there anything to be recognised at a predicted place.
+        let black = frame(WIDTH, HEIGHT, vec![0; WIDTH * HEIGHT]);
+        let black = masked.extract(&black).unwrap().pyramid;
+        let place = Point2::new(130.0, 200.0);
+        let patch = |pyramid: &Pyramid| pyramid.look(place, 1.0).unwrap().patch;
+        assert_eq!(patch(&pyramid), patch(&black));
     }
 
     #[test]
@@ -493,28 +512,39 @@ mod tests {
         assert!(right > 100 && right * 10 > matches.len() * 9, "{right} of {}", matches.len());
     }
 
-    /// Our forward model against OpenCV's inverse.
+    /// Our inverse against OpenCV's.
     #[test]
-    fn undistorted_pixels_distort_back() {
+    fn bearings_are_those_of_undistorted_pixels() {
         let camera = CameraConfig {
             fx: 517.3,
             fy: 516.5,
             cx: 318.6,
             cy: 255.3,
-            distortion: [0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
+            distortion: vec![0.2624, -0.9531, -0.0054, 0.0026, 1.1633],
             ..CameraConfig::default()
         };
-        let extractor =
-            OrbExtractor::new(&FeatureConfig::default(), &camera, &DepthConfig::default()).unwrap();
-        let grid = || {
-            (0..=16).flat_map(|i| {
-                (0..=12).map(move |j| Vector2::new(f64::from(i), f64::from(j)) * 40.0)
-            })
-        };
-        let undistorted = extractor.undistort(grid().map(Point2::from)).unwrap();
-        for (pixel, undistorted) in grid().zip(undistorted) {
-            let back = camera.distort(undistorted).coords;
-            assert!((back - pixel).norm() < 0.01, "{pixel:?} {back:?}");
+        let CameraConfig { fx, fy, cx, cy, .. } = camera;
+        let matrix = Mat::from_slice_2d(&[[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]).unwrap();
+        let grid: Vector<Point2d> = (0..=16)
+            .flat_map(|i| (0..=12).map(move |j| (f64::from(i), f64::from(j))))
+            .map(|(i, j)| Point2d::new(40.0 * i, 40.0 * j))
+            .collect();
+        let mut undistorted = Vector::<Point2d>::new();
+        calib3d::undistort_points_iter(
+            &grid,
+            &mut undistorted,
+            &matrix,
+            &Mat::from_slice(&camera.distortion).unwrap(),
+            &opencv::core::no_array(),
+            &opencv::core::no_array(),
+            TermCriteria::new(TermCriteria_Type::COUNT as i32, 200, 0.0).unwrap(),
+        )
+        .unwrap();
+        let camera = Camera::new(&camera).unwrap();
+        for (pixel, expected) in grid.iter().zip(undistorted) {
+            let bearing = camera.bearing(Point2::new(pixel.x, pixel.y)).unwrap();
+            let off = bearing.xy() / bearing.z - Vector2::new(expected.x, expected.y);
+            assert!(off.norm() < 1e-9, "{pixel:?} {expected:?} {bearing:?}");
         }
     }
 }

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::PointMeasurement;
 use crate::alignment::{WeightedPair, weighted_kabsch};
-use crate::sensor::PinholeCamera;
+use crate::sensor::Camera;
 
 /// Makes a model from some of the data.
 pub trait Estimator {
@@ -116,11 +116,11 @@ impl Correspondence {
     }
 }
 
-/// Agreement in the image and along the optical axis, each against its own threshold: the
+/// Agreement in the image and in depth, each against its own threshold: the
 /// errors of a depth camera differ too much between the two for one distance in metres.
 #[derive(Debug, Clone, Copy)]
 pub struct Reprojection {
-    pub camera: PinholeCamera,
+    pub camera: Camera,
     /// Standard deviations of the measured pixel.
     pub max_pixel_sigmas: f64,
     /// Standard deviations of measured and predicted depth together.
@@ -128,7 +128,7 @@ pub struct Reprojection {
 }
 
 impl Reprojection {
-    pub fn new(camera: &PinholeCamera, config: &RansacConfig) -> Self {
+    pub fn new(camera: &Camera, config: &RansacConfig) -> Self {
         Self {
             camera: *camera,
             max_pixel_sigmas: config.max_pixel_sigmas,
@@ -146,16 +146,18 @@ impl Consensus<Correspondence, Isometry3<f64>> for Reprojection {
             return f64::INFINITY;
         };
         let covariance = &datum.measurement.covariance;
-        let axis = world_from_camera.rotation * Vector3::z();
-        let depth_variance = covariance.m33 + axis.dot(&(datum.world_covariance * axis));
+        let in_camera = self.camera.depth_direction(measured);
+        let in_world = world_from_camera.rotation * in_camera;
+        let depth_variance = in_camera.dot(&(covariance * in_camera))
+            + in_world.dot(&(datum.world_covariance * in_world));
         let pixel_variance = self.camera.pixel_covariance(measured, covariance).trace() / 2.0;
         // `max` below would let a NaN pass.
         if !(depth_variance > 0.0 && pixel_variance > 0.0) {
             return f64::INFINITY;
         }
         let pixel = (a - b).norm_squared() / (pixel_variance * self.max_pixel_sigmas.powi(2));
-        let depth =
-            (expected.z - measured.z).powi(2) / (depth_variance * self.max_depth_sigmas.powi(2));
+        let nearer = self.camera.depth_of(&expected) - self.camera.depth_of(measured);
+        let depth = nearer.powi(2) / (depth_variance * self.max_depth_sigmas.powi(2));
         pixel.max(depth)
     }
 }
@@ -307,7 +309,7 @@ impl<Model> Scored<Model> {
 /// The same `seed` gives the same result.
 pub fn estimate_pose(
     correspondences: &[Correspondence],
-    camera: &PinholeCamera,
+    camera: &Camera,
     rotation_prior: Option<&UnitQuaternion<f64>>,
     config: &RansacConfig,
     seed: u64,
@@ -342,7 +344,7 @@ pub fn estimate_pose(
 /// Indices of the correspondences within `factor` times the tolerance of a pose.
 pub fn agreeing(
     correspondences: &[Correspondence],
-    camera: &PinholeCamera,
+    camera: &Camera,
     world_from_camera: &Isometry3<f64>,
     factor: f64,
     config: &RansacConfig,
@@ -359,7 +361,7 @@ pub fn agreeing(
 /// within twice the tolerance of the prediction. `None` if they do not determine one.
 pub fn agree_near(
     correspondences: &[Correspondence],
-    camera: &PinholeCamera,
+    camera: &Camera,
     world_from_camera: &Isometry3<f64>,
     config: &RansacConfig,
 ) -> Option<Agreement<Isometry3<f64>>> {
@@ -372,11 +374,13 @@ pub fn agree_near(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sensor::PinholeCamera;
     use crate::vision::DepthConfig;
     use nalgebra::Point2;
     use rand_distr::{Distribution, StandardNormal};
 
-    const CAMERA: PinholeCamera = PinholeCamera { fx: 517.0, fy: 516.0, cx: 318.0, cy: 255.0 };
+    const PINHOLE: PinholeCamera = PinholeCamera { fx: 517.0, fy: 516.0, cx: 318.0, cy: 255.0 };
+    const CAMERA: Camera = Camera::pinhole(PINHOLE);
 
     fn pose() -> Isometry3<f64> {
         Isometry3::new(Vector3::new(1.0, -0.3, 0.7), Vector3::new(0.2, -1.1, 0.4))
@@ -389,7 +393,7 @@ mod tests {
         let mut correspondence = |index: usize| {
             let pixel = Point2::new(rng.random_range(0.0..640.0), rng.random_range(0.0..480.0));
             let depth: f64 = rng.random_range(0.6..4.5);
-            let truth = CAMERA.unproject(pixel, depth);
+            let truth = PINHOLE.unproject(pixel, depth);
             let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
             let noisy = Point2::new(pixel.x + 0.7 * normal(), pixel.y + 0.7 * normal());
             let standard_deviation = depths.standard_deviation(depth);
@@ -398,7 +402,7 @@ mod tests {
                 slope: nalgebra::Vector2::zeros(),
                 standard_deviation,
             };
-            let measurement = PointMeasurement::new(&CAMERA, noisy, 0.7, &reading);
+            let measurement = PointMeasurement::new(&CAMERA, noisy, 0.7, &reading).unwrap();
             let mut world = (pose() * Point3::from(truth)).coords;
             if index % 10 < outliers {
                 world += Vector3::new(normal(), normal(), normal()).normalize()

@@ -1,15 +1,15 @@
 //! Depth images of a camera beside the color camera, as the color camera would see them.
 
-use nalgebra::{Isometry3, Point2, Vector3};
+use nalgebra::{Isometry3, Point2};
 
-use crate::sensor::{CameraConfig, DepthImage, PinholeCamera};
+use crate::sensor::{Camera, CameraConfig, DepthImage, PinholeCamera};
 
 /// How depth images are brought to the color camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DepthRegistration {
     /// Of the depth images, which are without distortion.
     pub depth_camera: PinholeCamera,
-    /// Of the color images as they are logged, with their distortion.
+    /// Of the color images as they are logged, of any model.
     pub color_camera: CameraConfig,
     pub color_from_depth: Isometry3<f64>,
     /// Width and height of the color images.
@@ -17,8 +17,8 @@ pub struct DepthRegistration {
 }
 
 impl DepthRegistration {
-    /// The depth image registered pixel for pixel to the color image; `None` if the size of the
-    /// color image is none.
+    /// The depth image registered pixel for pixel to the color image; `None` if the size or
+    /// the calibration of the color image is none.
     ///
     /// Each pixel of `depth` covers in the color image the box around its projected corners, all at
     /// its own depth; where several meet the nearest wins. (So does librealsense's `align`.) Depths
@@ -26,6 +26,7 @@ impl DepthRegistration {
     /// those that are covered.
     pub fn apply(&self, depth: &DepthImage) -> Option<DepthImage> {
         let (width, height) = self.color_size;
+        let lens = Camera::new(&self.color_camera).ok()?;
         let mut registered = vec![0_u16; width.checked_mul(height)?];
         let scale = f64::from(depth.scale());
         for (index, raw) in depth.data().iter().enumerate().filter(|(_, raw)| **raw != 0) {
@@ -36,11 +37,12 @@ impl DepthRegistration {
                 self.color_from_depth
                     * nalgebra::Point3::from(self.depth_camera.unproject(corner, distance))
             });
-            let [Some(first), Some(second)] = corners.map(|point| self.project(&point.coords))
+            let [Some(first), Some(second)] = corners.map(|point| lens.project(&point.coords))
             else {
                 continue;
             };
-            let units = ((corners[0].z + corners[1].z) / 2.0 / scale).round();
+            let depths = corners.map(|point| lens.depth_of(&point.coords));
+            let units = ((depths[0] + depths[1]) / 2.0 / scale).round();
             if !(units >= 1.0 && units <= f64::from(u16::MAX)) {
                 continue;
             }
@@ -53,16 +55,6 @@ impl DepthRegistration {
             }
         }
         DepthImage::new(width, height, depth.scale(), registered)
-    }
-
-    /// Where the color camera images a point (m, its coordinates).
-    fn project(&self, point: &Vector3<f64>) -> Option<Point2<f64>> {
-        let pixel = PinholeCamera::from(&self.color_camera).project(point)?;
-        let (width, height) = (self.color_size.0 as f64, self.color_size.1 as f64);
-        // Distortion is fitted to the image; far outside it may fold back.
-        let is_near =
-            (-width..2.0 * width).contains(&pixel.x) && (-height..2.0 * height).contains(&pixel.y);
-        is_near.then(|| self.color_camera.distort(pixel))
     }
 }
 
@@ -81,7 +73,7 @@ fn covered(first: f64, second: f64, count: usize) -> std::ops::Range<usize> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::UnitQuaternion;
+    use nalgebra::{UnitQuaternion, Vector3};
 
     use super::*;
 
@@ -124,7 +116,7 @@ mod tests {
     fn a_plane_is_where_the_color_camera_sees_it() {
         let turn = UnitQuaternion::from_euler_angles(0.02, -0.03, 0.05);
         let color_from_depth = Isometry3::from_parts(Vector3::new(-0.06, 0.01, 0.02).into(), turn);
-        let distortion = [0.05, -0.03, 0.001, -0.002, 0.0];
+        let distortion = vec![0.05, -0.03, 0.001, -0.002, 0.0];
         let plain = registration(2.0, (80, 60));
         let color_camera = CameraConfig { distortion, ..plain.color_camera.clone() };
         let registration = DepthRegistration { color_from_depth, color_camera, ..plain };
@@ -138,15 +130,17 @@ mod tests {
         let registered = registration.apply(&depth).unwrap();
         let color_normal = color_from_depth.rotation * normal;
         let color_d = d + color_normal.dot(&color_from_depth.translation.vector);
-        let camera = PinholeCamera::from(&registration.color_camera);
+        let pinhole = registration.color_camera.intrinsics();
+        let lens = Camera::new(&registration.color_camera).unwrap();
         let mut checked = 0;
         for row in 0..60 {
             for column in 0..80 {
                 let ideal = Point2::new(column as f64, row as f64);
-                let pixel = registration.color_camera.distort(ideal);
+                let ray = pinhole.unproject(ideal, 1.0);
+                let pixel = lens.project(&ray).unwrap();
                 let (c, r) = (pixel.x.round() as usize, pixel.y.round() as usize);
                 let Some(measured) = registered.at(c, r) else { continue };
-                let expected = color_d / color_normal.dot(&camera.unproject(ideal, 1.0));
+                let expected = color_d / color_normal.dot(&ray);
                 // A pixel of the depth camera and the plane's slope.
                 assert!((f64::from(measured) - expected).abs() < 0.01, "{measured} {expected}");
                 checked += 1;

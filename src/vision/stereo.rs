@@ -3,12 +3,18 @@
 //! A match at disparity `d` (pixels) lies at depth `z = f b / d`, so an error of the disparity by
 //! `sigma_d` moves it by `sigma_z = z^2 sigma_d / (f b)`: the quadratic law of
 //! [`DepthConfig`](super::DepthConfig), with `noise_quadratic = sigma_d / (f b)`.
+//!
+//! A pinhole shows only the middle of what a wide lens sees. There the rectified images serve for
+//! matching alone: what is measured is the left image as taken, with the range where it was matched.
 
 use std::ops::RangeInclusive;
 
 use nalgebra::{Isometry3, Matrix3, Point2, Rotation3, Vector3};
 
-use crate::sensor::{CameraConfig, ColorImage, DepthImage, PinholeCamera, PixelFormat};
+use crate::sensor::{
+    Camera, CameraConfig, CameraError, CameraModel, ColorImage, DepthImage, PinholeCamera,
+    PixelFormat,
+};
 
 /// Half the sides of the window that is compared, pixels.
 const HALF_WIDTH: usize = 5;
@@ -40,6 +46,8 @@ pub enum StereoError {
     Baseline(f64),
     #[error("the second camera is not to the right of the first")]
     Order,
+    #[error("the {0} camera: {1}")]
+    Camera(&'static str, CameraError),
     #[error("images of {0}x{1} pixels")]
     Size(usize, usize),
 }
@@ -48,15 +56,21 @@ pub enum StereoError {
 #[derive(Debug, Clone)]
 pub struct StereoRig {
     size: (usize, usize),
+    /// Of the images of [`Self::measure`].
     camera: CameraConfig,
+    /// Of the images that are matched.
+    rectified: PinholeCamera,
     baseline: f64,
+    /// Of a wide left lens, whose images are left as taken.
+    wide: Option<(Camera, Rotation3<f64>)>,
     /// By pixel of the rectified images: where in the image as taken.
     left: Vec<Point2<f32>>,
     right: Vec<Point2<f32>>,
 }
 
 /// The left camera as it would be if both looked straight across their baseline, rows of their
-/// images corresponding; cameras with their mountings on a common body.
+/// images corresponding, or, if its lens is a wide one, as it is: that of the images of
+/// [`StereoRig::measure`]. Cameras with their mountings on a common body.
 pub fn rectified_camera(
     left: &CameraConfig,
     right: &CameraConfig,
@@ -65,8 +79,9 @@ pub fn rectified_camera(
 }
 
 struct Rectification {
-    /// The rectified left camera.
+    /// The rectified left camera, or a wide one as it is.
     camera: CameraConfig,
+    rectified: PinholeCamera,
     baseline: f64,
     left_from_rectified: Rotation3<f64>,
     right_from_rectified: Rotation3<f64>,
@@ -97,19 +112,22 @@ impl Rectification {
         let body_from_rectified =
             body_from_left * Isometry3::from_parts(Default::default(), left_from_rectified.into());
         let matrix = body_from_rectified.to_homogeneous();
-        let camera = CameraConfig {
+        let rectified = CameraConfig {
+            model: CameraModel::RadialTangential,
             fx: focal,
             fy: focal,
             cx: 0.5 * (left.cx + right.cx),
             cy: 0.5 * (left.cy + right.cy),
-            distortion: [0.0; 5],
+            distortion: Vec::new(),
             imu_from_camera: std::array::from_fn(|row| {
                 std::array::from_fn(|column| matrix[(row, column)])
             }),
             time_offset: left.time_offset,
             readout_time: left.readout_time,
         };
-        Ok(Self { camera, baseline, left_from_rectified, right_from_rectified })
+        let pinhole = rectified.intrinsics();
+        let camera = if left.model.is_wide() { left.clone() } else { rectified };
+        Ok(Self { camera, rectified: pinhole, baseline, left_from_rectified, right_from_rectified })
     }
 }
 
@@ -124,16 +142,17 @@ impl StereoRig {
         if !(SIDES.contains(&size.0) && SIDES.contains(&size.1)) {
             return Err(StereoError::Size(size.0, size.1));
         }
-        let Rectification { camera, baseline, left_from_rectified, right_from_rectified } =
-            Rectification::new(left, right)?;
-        let pinhole = PinholeCamera::from(&camera);
-        let map = |source: &CameraConfig, rotation: &Rotation3<f64>| {
+        let lens = |side, config| Camera::new(config).map_err(|e| StereoError::Camera(side, e));
+        let (left_lens, right_lens) = (lens("left", left)?, lens("right", right)?);
+        let rectification = Rectification::new(left, right)?;
+        let (rectified, baseline) = (rectification.rectified, rectification.baseline);
+        let left_from_rectified = rectification.left_from_rectified;
+        let map = |source: &Camera, rotation: &Rotation3<f64>| {
             let at = |row: usize, column: usize| {
                 let pixel = Point2::new(column as f64, row as f64);
-                let ray = rotation * pinhole.unproject(pixel, 1.0);
-                let seen = PinholeCamera::from(source).project(&ray);
-                // Behind the camera there is nothing to see.
-                seen.map_or(Point2::new(-1.0, -1.0), |pixel| source.distort(pixel).cast())
+                let ray = rotation * rectified.unproject(pixel, 1.0);
+                // What the lens does not image is not to be seen.
+                source.project(&ray).map_or(Point2::new(-1.0, -1.0), |pixel| pixel.cast())
             };
             (0..size.1)
                 .flat_map(|row| (0..size.0).map(move |column| (row, column)))
@@ -142,25 +161,27 @@ impl StereoRig {
         };
         Ok(Self {
             size,
-            left: map(left, &left_from_rectified),
-            right: map(right, &right_from_rectified),
-            camera,
+            left: map(&left_lens, &left_from_rectified),
+            right: map(&right_lens, &rectification.right_from_rectified),
+            camera: rectification.camera,
+            rectified,
             baseline,
+            wide: left.model.is_wide().then_some((left_lens, left_from_rectified)),
         })
     }
 
-    /// The rectified left camera, as the images of [`Self::measure`] are taken.
+    /// The camera of the images of [`Self::measure`]: see [`rectified_camera`].
     pub fn camera(&self) -> &CameraConfig {
         &self.camera
     }
 
     /// Focal length times baseline, pixel m.
     pub fn focal_baseline(&self) -> f64 {
-        self.camera.fx * self.baseline
+        self.rectified.fx * self.baseline
     }
 
-    /// The rectified left image and the depth (mm) of its points that were matched, 0 elsewhere;
-    /// `None` if the images are not of the rig's size.
+    /// The rectified left image and the depth (mm) of its points that were matched, 0 elsewhere; of
+    /// a wide lens the image as taken, and the range. `None` if the images are not of the rig's size.
     pub fn measure(
         &self,
         left: &ColorImage,
@@ -170,17 +191,51 @@ impl StereoRig {
         if !fits(left) || !fits(right) {
             return None;
         }
-        let (left, right) = (
-            remap(&grey(left), self.size, &self.left),
-            remap(&grey(right), self.size, &self.right),
-        );
+        let taken = grey(left);
+        let left = remap(&taken, self.size, &self.left);
+        let right = remap(&grey(right), self.size, &self.right);
         let depth = self.depths(&left, &right);
+        let (shown, depth) = match &self.wide {
+            Some((lens, left_from_rectified)) => {
+                (taken, self.ranges(&depth, lens, left_from_rectified))
+            }
+            None => (left, depth),
+        };
         let (width, height) = self.size;
-        let pixels = left.iter().map(|value| value.round() as u8).collect();
+        let pixels = shown.iter().map(|value| value.round() as u8).collect();
         Some((
             ColorImage::new(width, height, PixelFormat::Mono8, pixels)?,
             DepthImage::new(width, height, SCALE, depth)?,
         ))
+    }
+
+    /// Depths of the rectified image as ranges of the left image as taken; the nearest one counts.
+    fn ranges(
+        &self,
+        depths: &[u16],
+        lens: &Camera,
+        left_from_rectified: &Rotation3<f64>,
+    ) -> Vec<u16> {
+        let (width, height) = self.size;
+        let mut ranges = vec![0_u16; width * height];
+        for (index, depth) in depths.iter().enumerate().filter(|(_, depth)| **depth > 0) {
+            let pixel = Point2::new((index % width) as f64, (index / width) as f64);
+            let point = left_from_rectified * self.rectified.unproject(pixel, f64::from(*depth));
+            let Some(seen) = lens.project(&point).map(|seen| seen.map(f64::round)) else {
+                continue;
+            };
+            let inside =
+                (0.0..width as f64).contains(&seen.x) && (0.0..height as f64).contains(&seen.y);
+            let range = lens.depth_of(&point).round();
+            if !inside || range > f64::from(u16::MAX) {
+                continue;
+            }
+            let nearest = &mut ranges[seen.y as usize * width + seen.x as usize];
+            if *nearest == 0 || (range as u16) < *nearest {
+                *nearest = range as u16;
+            }
+        }
+        ranges
     }
 
     fn depths(&self, left: &[f32], right: &[f32]) -> Vec<u16> {
@@ -356,10 +411,9 @@ mod tests {
             fy: 202.0,
             cx: 99.0,
             cy: 72.0,
-            distortion: [-0.2, 0.05, 1e-3, -5e-4, 0.0],
+            distortion: vec![-0.2, 0.05, 1e-3, -5e-4, 0.0],
             imu_from_camera: std::array::from_fn(|r| std::array::from_fn(|c| pose[(r, c)])),
-            time_offset: 0.0,
-            readout_time: 0.0,
+            ..CameraConfig::default()
         }
     }
 
@@ -380,17 +434,13 @@ mod tests {
     const SLOPE: f64 = 0.3;
     const DEPTH: f64 = 1.5;
 
-    /// What a camera sees of the plane: its pixels are undistorted by iteration.
+    /// What a camera sees of the plane.
     fn view(camera: &CameraConfig) -> ColorImage {
         let body_from_camera = camera.imu_from_camera().unwrap();
-        let pinhole = PinholeCamera::from(camera);
+        let lens = Camera::new(camera).unwrap();
         let color = |row: i32, column: i32| {
-            let seen = Point2::new(f64::from(column), f64::from(row));
-            let mut pixel = seen;
-            for _ in 0..20 {
-                pixel += seen - camera.distort(pixel);
-            }
-            let ray = body_from_camera.rotation * pinhole.unproject(pixel, 1.0);
+            let pixel = Point2::new(f64::from(column), f64::from(row));
+            let ray = body_from_camera.rotation * lens.unproject(pixel, 1.0).unwrap();
             let origin = body_from_camera.translation.vector;
             let distance = (DEPTH + SLOPE * origin.x - origin.z) / (ray.z - SLOPE * ray.x);
             let point = origin + ray * distance;
@@ -404,7 +454,7 @@ mod tests {
     #[test]
     fn a_point_is_seen_in_the_same_row_by_both_cameras() {
         let (left, right, rig) = rig();
-        let pinhole = PinholeCamera::from(rig.camera());
+        let pinhole = rig.camera().intrinsics();
         let body_from_rectified = rig.camera().imu_from_camera().unwrap();
         for pixel in [Point2::new(100.0, 75.0), Point2::new(60.0, 40.0), Point2::new(150.0, 110.0)]
         {
@@ -413,7 +463,7 @@ mod tests {
                 body_from_rectified * nalgebra::Point3::from(pinhole.unproject(pixel, depth));
             let seen = |camera: &CameraConfig| {
                 let local = camera.imu_from_camera().unwrap().inverse() * point;
-                camera.distort(PinholeCamera::from(camera).project(&local.coords).unwrap())
+                Camera::new(camera).unwrap().project(&local.coords).unwrap()
             };
             let index = |pixel: Point2<f64>| pixel.y as usize * 200 + pixel.x as usize;
             assert_relative_eq!(rig.left[index(pixel)].cast(), seen(&left), epsilon = 1e-3);
@@ -430,7 +480,7 @@ mod tests {
         let (left, right, rig) = rig();
         let (color, depth) = rig.measure(&view(&left), &view(&right)).unwrap();
         assert_eq!((color.width(), color.height(), color.format()), (200, 150, PixelFormat::Mono8));
-        let pinhole = PinholeCamera::from(rig.camera());
+        let pinhole = rig.camera().intrinsics();
         let body_from_rectified = rig.camera().imu_from_camera().unwrap();
         let mut errors = Vec::new();
         for (row, column) in (0..150).flat_map(|row| (0..200).map(move |column| (row, column))) {
@@ -446,6 +496,39 @@ mod tests {
         errors.sort_by(|a, b| a.abs().total_cmp(&b.abs()));
         let part = |percent: usize| errors[errors.len() * percent / 100].abs();
         assert!(part(68) < 0.25 && part(95) < 0.6, "{} {}", part(68), part(95));
+    }
+
+    #[test]
+    fn ranges_of_wide_lenses_are_those_of_their_images_as_taken() {
+        let wide = |camera: CameraConfig| CameraConfig {
+            model: CameraModel::Equidistant,
+            fx: 110.0,
+            fy: 110.0,
+            distortion: vec![0.003, 0.0007, -0.002, 0.0002],
+            ..camera
+        };
+        let left = wide(camera(0.0, Vector3::new(0.01, -0.02, 0.005)));
+        let right = wide(camera(0.12, Vector3::new(-0.01, 0.015, -0.01)));
+        let rig = StereoRig::new(&left, &right, (200, 150)).unwrap();
+        assert_eq!((rig.camera(), &rectified_camera(&left, &right).unwrap()), (&left, &left));
+        let taken = view(&left);
+        let (color, ranges) = rig.measure(&taken, &view(&right)).unwrap();
+        assert_eq!(color, taken);
+        let lens = Camera::new(&left).unwrap();
+        let body_from_left = left.imu_from_camera().unwrap();
+        let mut errors = Vec::new();
+        for (row, column) in (0..150).flat_map(|row| (0..200).map(move |column| (row, column))) {
+            let Some(measured) = ranges.at(column, row) else { continue };
+            let bearing = lens.bearing(Point2::new(column as f64, row as f64)).unwrap();
+            let ray = body_from_left.rotation * bearing.into_inner();
+            let origin = body_from_left.translation.vector;
+            let truth = (DEPTH + SLOPE * origin.x - origin.z) / (ray.z - SLOPE * ray.x);
+            errors.push((f64::from(measured) / truth - 1.0).abs());
+        }
+        assert!(errors.len() > 2000, "{}", errors.len());
+        errors.sort_by(f64::total_cmp);
+        let part = |percent: usize| errors[errors.len() * percent / 100];
+        assert!(part(50) < 0.03 && part(90) < 0.12, "{} {}", part(50), part(90));
     }
 
     #[test]

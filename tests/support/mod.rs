@@ -3,6 +3,7 @@
 // Each test program uses a part of it.
 #![allow(dead_code)]
 
+pub mod messages;
 pub mod ros2;
 
 use std::path::{Path, PathBuf};

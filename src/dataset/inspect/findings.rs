@@ -1,9 +1,9 @@
 //! From what was seen to what it means and what to do.
 
+use nalgebra::Isometry3;
 use serde::Serialize;
 
-use super::{AccelerometerUnit, GyroscopeUnit};
-use super::{Assumed, Evidence, Inspection, Sign, TopicInspection};
+use super::{Assumed, Inspection, TopicInspection, Trial};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -32,6 +32,8 @@ pub struct Verdict {
     pub text: String,
     /// For `--set`.
     pub settings: Vec<String>,
+    /// Commands that can use the log: `replay`, `attitude`, `gnss`.
+    pub fit_for: Vec<&'static str>,
 }
 
 /// An IMU slower than this leaves too much to interpolation, Hz.
@@ -42,20 +44,29 @@ const FEW: f64 = 0.02;
 const SPARSE_DEPTH: f64 = 0.3;
 /// Median depths outside this range are not those of a room, m.
 const ROOM: std::ops::RangeInclusive<f64> = 0.2..=15.0;
+/// Scales of a gyroscope within this fraction of a unit are of that unit.
+const SAME_UNIT: f64 = 0.15;
+/// Axes that differ by less than this are not turned: mountings are seldom better known, degrees.
+const SAME_AXES_DEG: f64 = 10.0;
+/// Clocks that differ by more than this spoil an estimate, s.
+const LARGEST_CLOCK_ERROR: f64 = 0.01;
+/// Intervals between messages of a sensor, s.
+const USUAL_INTERVALS: std::ops::Range<f64> = 5e-5..20.0;
 /// Two scales that differ by less than this are the same.
 const SAME_SCALE: f64 = 0.01;
 /// Channel means closer than this do not tell red from blue.
 const CLEAR_RATIO: f64 = 1.05;
 
-struct Findings(Vec<Finding>);
+#[derive(Default)]
+pub(super) struct Findings(pub Vec<Finding>);
 
 impl Findings {
-    fn add(&mut self, severity: Severity, subject: &'static str, message: String) {
+    pub fn add(&mut self, severity: Severity, subject: &'static str, message: String) {
         self.0.push(Finding { severity, subject, message, setting: None });
     }
 
     /// States what the log holds; if that is not what is assumed, how to set it.
-    fn setting(
+    pub fn setting(
         &mut self,
         subject: &'static str,
         message: String,
@@ -82,11 +93,18 @@ pub(super) fn judge(inspection: &Inspection, assumed: &Assumed) -> (Vec<Finding>
         }
     }
     reordering(&mut findings, inspection, assumed);
+    clocks(&mut findings, inspection);
+    calibration(&mut findings, inspection, assumed);
     color(&mut findings, inspection, assumed);
     depth(&mut findings, inspection, assumed);
     pairs(&mut findings, inspection);
-    imu(&mut findings, inspection, assumed);
+    if let Some(imu) = &inspection.imu {
+        super::accelerometer::judge(&mut findings, imu, assumed);
+    }
+    gyroscope(&mut findings, inspection, assumed);
+    turns(&mut findings, inspection, assumed);
     truth(&mut findings, inspection);
+    trial(&mut findings, inspection);
     for (reason, count) in &inspection.skipped {
         findings.add(Severity::Warning, "log", format!("{reason}: {count}"));
     }
@@ -107,12 +125,35 @@ fn verdict(findings: &[Finding], inspection: &Inspection) -> Verdict {
         }
     }
     let purpose = if inspection.imu.is_some() { "VIO" } else { "RGB-D odometry (it has no IMU)" };
-    let text = match (errors.is_empty(), settings.is_empty()) {
+    let quoted = |setting: &String| match setting.contains([' ', '[']) {
+        true => format!("'{setting}'"),
+        false => setting.clone(),
+    };
+    let set = settings.iter().map(quoted).collect::<Vec<_>>().join(" --set ");
+    let mut text = match (errors.is_empty(), settings.is_empty()) {
         (false, _) => format!("not fit for {purpose}: {}", errors.join("; ")),
         (true, true) => format!("fit for {purpose}"),
-        (true, false) => format!("fit for {purpose} with --set {}", settings.join(" --set ")),
+        (true, false) => format!("fit for {purpose} with --set {set}"),
     };
-    Verdict { fit: errors.is_empty(), text, settings }
+    let fit_for = fit_for(errors.is_empty(), inspection);
+    if !errors.is_empty() && !fit_for.is_empty() {
+        text += &format!("; fit for {}", fit_for.join(" and "));
+    }
+    Verdict { fit: errors.is_empty(), text, settings, fit_for }
+}
+
+/// Commands that can use the log.
+fn fit_for(replay: bool, inspection: &Inspection) -> Vec<&'static str> {
+    let has_imu = inspection.imu.as_ref().is_some_and(|imu| !imu.is_zero)
+        && inspection.topic("imu").is_some_and(|topic| topic.messages > 1);
+    let is_fix = |topic: &TopicInspection| {
+        let kind = topic.schema.replace("/msg/", "/");
+        topic.messages > 1
+            && ["sensor_msgs/NavSatFix", "nmea_msgs/Sentence"].contains(&kind.as_str())
+    };
+    let has_fix = inspection.topics.values().any(is_fix);
+    let all = [("replay", replay), ("attitude", has_imu), ("gnss", has_imu && has_fix)];
+    all.into_iter().filter(|(_, fits)| *fits).map(|(name, _)| name).collect()
 }
 
 fn streams(findings: &mut Findings, inspection: &Inspection) {
@@ -318,57 +359,196 @@ fn pairs(findings: &mut Findings, inspection: &Inspection) {
     findings.add(if many { Severity::Warning } else { Severity::Ok }, "frames", text);
 }
 
-fn imu(findings: &mut Findings, inspection: &Inspection, assumed: &Assumed) {
-    let Some(imu) = &inspection.imu else { return };
-    let [x, y, z] = imu.acceleration;
-    let state = match imu.at_rest {
-        true => format!("at rest (at {:.2} s) the accelerometer reads", imu.quietest),
-        false => "never at rest for half a second; at its quietest the accelerometer reads".into(),
+fn gyroscope(findings: &mut Findings, inspection: &Inspection, assumed: &Assumed) {
+    let by_truth = inspection.imu.as_ref().and_then(|imu| imu.gyroscope_scale());
+    let unit = |scale: f64| match scale {
+        s if (s - 1.0).abs() < SAME_UNIT => Some((1.0, "rad/s")),
+        s if (s.to_degrees() - 1.0).abs() < SAME_UNIT => Some((1_f64.to_radians(), "deg/s")),
+        _ => None,
     };
-    let reads = format!("{state} ({x:.3}, {y:.3}, {z:.3}), norm {:.3}", imu.acceleration_norm);
-    let unit = match imu.accelerometer_unit {
-        AccelerometerUnit::MetresPerSecondSquared => "m/s^2",
-        AccelerometerUnit::StandardGravities => "g",
-        AccelerometerUnit::Unknown => {
-            let text = format!("{reads}: neither m/s^2 nor g");
-            findings.add(Severity::Error, "imu", text);
-            return;
-        }
+    let (scale, name, source) = match (by_truth.and_then(unit), &inspection.turns) {
+        (Some((scale, name)), _) => (scale, name, "the reference"),
+        (None, Some(turns)) => match unit(turns.gyroscope_scale) {
+            Some((scale, name)) => (scale, name, "the images"),
+            None => {
+                let factor = turns.gyroscope_scale;
+                let text = format!(
+                    "the gyroscope reads {:.3} times the turns of the images; if they are right, set \
+                     `imu.gyroscope_scale = {factor:.4}`",
+                    1.0 / factor
+                );
+                return findings.add(Severity::Warning, "imu", text);
+            }
+        },
+        (None, None) => return,
     };
-    let source = match imu.sign_from {
-        Evidence::Truth => " (by the accelerations of the reference)",
-        Evidence::CameraMounting => " (by the camera's mounting, if it is held upright)",
-        Evidence::None => "",
-    };
-    let sign = match imu.gravity_sign {
-        Sign::Regular => "sign regular",
-        Sign::Inverted => "sign inverted",
-        Sign::Unknown => "sign unknown",
-    };
-    let message = format!("{reads}: {unit}, {sign}{source}");
-    match imu.accelerometer_scale() {
-        Some(scale) => {
-            let is_assumed = (assumed.imu.accelerometer_scale / scale - 1.0).abs() < SAME_SCALE;
-            let value = toml::Value::Float(scale).to_string();
-            findings.setting("imu", message, ("imu.accelerometer_scale", value), is_assumed);
-        }
-        None => {
+    let is_assumed = (assumed.imu.gyroscope_scale / scale - 1.0).abs() < SAME_SCALE;
+    let message = format!("gyroscope in {name} (by the turns of {source})");
+    let value = toml::Value::Float(scale).to_string();
+    findings.setting("imu", message, ("imu.gyroscope_scale", value), is_assumed);
+}
+
+/// What the turns that camera and gyroscope see say of the mounting and of the clocks.
+fn turns(findings: &mut Findings, inspection: &Inspection, assumed: &Assumed) {
+    let Some(turns) = &inspection.turns else { return };
+    if turns.is_mirrored {
+        let axes = turns.correction(&assumed.body_from_camera.unwrap_or_default());
+        let text = format!(
+            "the axes of the IMU are left-handed ({axes}): no mounting fits; negate the axis in the \
+             driver, or swap the two that are confused"
+        );
+        return findings.add(Severity::Error, "imu", text);
+    }
+    let off = assumed.body_from_camera.and_then(|mounting| turns.angle_to(&mounting));
+    let value = || mounting_value(turns.mounting().unwrap_or_default(), assumed);
+    let key = "camera.imu_from_camera";
+    match (off, &assumed.body_from_camera) {
+        (Some(degrees), Some(_)) if degrees < SAME_AXES_DEG.max(5.0 * turns.sd_deg) => {
             let text = format!(
-                "{message}; with the IMU upright its vertical axis must read +1 g, else negate \
-                 `imu.accelerometer_scale`"
+                "camera and gyroscope turn alike: the mounting is right to {degrees:.1} degrees (known \
+                 to {:.1})",
+                turns.sd_deg
             );
-            findings.add(Severity::Warning, "imu", text);
+            findings.add(Severity::Ok, "imu", text);
+        }
+        (Some(degrees), Some(mounting)) => {
+            let text = format!(
+                "the axes of the IMU are not those of the mounting: turned by {degrees:.0} degrees, {} \
+                 (by turns that images and gyroscope see, to {:.1} degrees)",
+                turns.correction(mounting),
+                turns.sd_deg
+            );
+            findings.setting("imu", text, (key, value()), false);
+        }
+        _ => {
+            let text = format!(
+                "the mounting of the camera on the IMU is not in the log; turns that both see give its \
+                 rotation to {:.1} degrees",
+                turns.sd_deg
+            );
+            findings.setting("imu", text, (key, value()), false);
         }
     }
-    if let Some(scale) = imu.gyroscope_scale() {
-        let unit = match imu.gyroscope_unit {
-            GyroscopeUnit::DegreesPerSecond => "deg/s",
-            GyroscopeUnit::RadiansPerSecond | GyroscopeUnit::Unknown => "rad/s",
-        };
-        let is_assumed = (assumed.imu.gyroscope_scale / scale - 1.0).abs() < SAME_SCALE;
-        let message = format!("gyroscope in {unit} (by the turns of the reference)");
-        let value = toml::Value::Float(scale).to_string();
-        findings.setting("imu", message, ("imu.gyroscope_scale", value), is_assumed);
+    let late = turns.time_offset - assumed.time_offset;
+    if late.abs() > LARGEST_CLOCK_ERROR {
+        let text = format!(
+            "the images are stamped {:.0} ms too {} for the gyroscope",
+            1000.0 * late.abs(),
+            if late > 0.0 { "early" } else { "late" }
+        );
+        let value = format!("{:.3}", turns.time_offset);
+        findings.setting("imu", text, ("camera.time_offset", value), false);
+    }
+}
+
+/// A row-major matrix with the found rotation and the assumed place.
+fn mounting_value(rotation: nalgebra::UnitQuaternion<f64>, assumed: &Assumed) -> String {
+    let place = assumed.body_from_camera.map(|mounting| mounting.translation).unwrap_or_default();
+    let matrix = Isometry3::from_parts(place, rotation).to_homogeneous();
+    let row = |row: usize| {
+        let entries: Vec<_> =
+            (0..4).map(|column| format!("{:.6}", matrix[(row, column)])).collect();
+        format!("[{}]", entries.join(", "))
+    };
+    format!("[{}]", (0..4).map(row).collect::<Vec<_>>().join(", "))
+}
+
+/// Whether the streams are of the same time, and stamped in seconds.
+fn clocks(findings: &mut Findings, inspection: &Inspection) {
+    let spans = ["color", "depth", "imu"].into_iter().filter_map(|role| {
+        let timing = inspection.topic(role)?.timing.as_ref()?;
+        Some((role, inspection.summary.sources.get(role)?, timing))
+    });
+    let spans: Vec<_> = spans.collect();
+    for (role, source, timing) in &spans {
+        let interval = timing.rate.map_or(f64::NAN, |rate| 1.0 / rate);
+        let unit = [("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)];
+        let is_usual = |seconds: f64| USUAL_INTERVALS.contains(&seconds);
+        let taken = unit.iter().find(|(_, per_second)| is_usual(interval / per_second));
+        if let (Some((unit, _)), false) = (taken, is_usual(interval) || interval.is_nan()) {
+            let text = format!(
+                "stamps of {source} are {interval:.3e} s apart: they are {unit}, not seconds"
+            );
+            findings.add(Severity::Error, *role, text);
+        }
+    }
+    for (first, second) in [("imu", "color"), ("imu", "depth"), ("depth", "color")] {
+        let of = |role: &str| spans.iter().find(|(name, _, _)| *name == role);
+        let (Some((role, a, x)), Some((_, b, y))) = (of(first), of(second)) else { continue };
+        if x.last < y.first || y.last < x.first {
+            let text = format!(
+                "stamps of {a} cover {:.3} to {:.3} s, of {b} {:.3} to {:.3} s: they do not overlap; \
+                 they are of different clocks",
+                x.first, x.last, y.first, y.last
+            );
+            findings.add(Severity::Error, *role, text);
+        }
+    }
+}
+
+/// What is known of the camera, and whether depth is that of its pixels.
+fn calibration(findings: &mut Findings, inspection: &Inspection, assumed: &Assumed) {
+    for problem in &inspection.summary.calibration.problems {
+        findings.add(Severity::Warning, "color", problem.clone());
+    }
+    let (intrinsics, mounting): (Vec<&str>, Vec<&str>) =
+        assumed.missing.iter().copied().partition(|key| !key.ends_with("imu_from_camera"));
+    if !intrinsics.is_empty() {
+        let text = format!(
+            "no calibration of the camera ({}): record its CameraInfo, or give it with --config or \
+             --set",
+            intrinsics.join(", ")
+        );
+        findings.add(Severity::Error, "color", text);
+    }
+    let is_found = inspection.turns.as_ref().is_some_and(|turns| !turns.is_mirrored);
+    if !mounting.is_empty() && !is_found {
+        let text = "no mounting of the camera on the IMU (camera.imu_from_camera): record the \
+                    transforms (/tf_static), or give it with --config; a log in which the camera turns \
+                    about several axes would tell its rotation";
+        findings.add(Severity::Error, "imu", text.to_owned());
+    }
+    if let Some(registration) = &inspection.summary.calibration.registration {
+        let offset = 1000.0 * registration.color_from_depth.translation.vector.norm();
+        let text = format!(
+            "the depth camera is {offset:.0} mm from the color camera: its images are registered to \
+             those of color by both calibrations"
+        );
+        return findings.add(Severity::Note, "depth", text);
+    }
+    let sizes = ["color", "depth"].map(|role| inspection.topic(role).and_then(|topic| topic.size));
+    if let [Some(color), Some(depth)] = sizes
+        && color != depth
+    {
+        let text = format!(
+            "depth images have {}x{} pixels, color images {}x{}: they are not registered",
+            depth.0, depth.1, color.0, color.1
+        );
+        // Whether that can be mended shows in the trial.
+        let is_mended = inspection.trial.as_ref().is_some_and(|trial| trial.processed > 0);
+        let severity = if is_mended { Severity::Note } else { Severity::Error };
+        findings.add(severity, "depth", text);
+    }
+}
+
+/// What came of the estimator's start.
+fn trial(findings: &mut Findings, inspection: &Inspection) {
+    let Some(Trial { frames, processed, reason, settings }) = &inspection.trial else { return };
+    let with = match settings.is_empty() {
+        true => String::new(),
+        false => " with these settings".to_owned(),
+    };
+    match (processed, reason) {
+        (0, reason) => {
+            let why = reason.clone().unwrap_or_else(|| "there are none".to_owned());
+            let text = format!("replay{with} processes no frame: {why}");
+            findings.add(Severity::Error, "frames", text);
+        }
+        (processed, _) => {
+            let text = format!("replay{with} processes {processed} of the first {frames} frames");
+            let severity = if *processed * 2 < *frames { Severity::Warning } else { Severity::Ok };
+            findings.add(severity, "frames", text);
+        }
     }
 }
 

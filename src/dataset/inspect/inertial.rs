@@ -11,6 +11,9 @@ const MOST_SAMPLES: usize = 100_000;
 /// Standard gravity, m/s^2: one g.
 const STANDARD_GRAVITY: f64 = 9.80665;
 
+/// Length of the span whose turns are compared with those of the images, s.
+pub(super) const LIVELY_SPAN: f64 = 8.0;
+
 /// Length of a window in which the IMU may be at rest, s.
 const REST_WINDOW: f64 = 0.5;
 /// At rest the angular velocity is below this (rms about its mean plus the mean), rad/s.
@@ -24,11 +27,15 @@ const HALF_WINDOW: f64 = 0.25;
 const LONGEST_STEP: f64 = 0.1;
 /// A fit to the reference is believed if it explains all but this part of the variance.
 const LARGEST_RESIDUAL: f64 = 0.2;
+/// A fitted scale that is known worse than this, as a fraction, tells nothing.
+const LARGEST_SCALE_SD: f64 = 0.1;
+/// Less gravity than this in the readings is none, m/s^2.
+pub(super) const LEAST_GRAVITY: f64 = 0.3;
 /// Readings within this factor of a unit are of that unit.
 const TOLERANCE: f64 = 0.15;
 
 /// IMU samples as logged and the reference poses, in order of arrival.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Inertial {
     samples: Vec<ImuSample>,
     truth: Vec<TruthPose>,
@@ -55,6 +62,12 @@ pub struct ImuInspection {
     pub gyroscope_unit: GyroscopeUnit,
     /// Direction that points up in the world of the reference poses, where a fit finds it.
     pub truth_up: Option<[f64; 3]>,
+    /// Every reading of the accelerometer is zero.
+    pub is_zero: bool,
+    /// By the accelerations of the reference, or of the images.
+    pub fit: Option<AccelerometerFit>,
+    /// Where the eight seconds with the fastest turns begin, s.
+    pub liveliest: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -92,27 +105,14 @@ pub enum Sign {
 pub enum Evidence {
     /// Accelerations of the reference positions.
     Truth,
+    /// Accelerations of the camera, by its images.
+    Images,
     /// A camera that is mounted as configured and held upright.
     CameraMounting,
     None,
 }
 
 impl ImuInspection {
-    /// The factor that makes specific force in m/s^2 of the readings; `None` if undecided.
-    pub fn accelerometer_scale(&self) -> Option<f64> {
-        let unit = match self.accelerometer_unit {
-            AccelerometerUnit::MetresPerSecondSquared => 1.0,
-            // The recordings with which this program is concerned divided by 9.81.
-            AccelerometerUnit::StandardGravities => 9.81,
-            AccelerometerUnit::Unknown => return None,
-        };
-        match self.gravity_sign {
-            Sign::Regular => Some(unit),
-            Sign::Inverted => Some(-unit),
-            Sign::Unknown => None,
-        }
-    }
-
     /// The factor that makes rad/s of the gyroscope's readings; `None` if undecided.
     pub fn gyroscope_scale(&self) -> Option<f64> {
         match self.gyroscope_unit {
@@ -136,19 +136,34 @@ impl Inertial {
         }
     }
 
-    /// `body_from_camera`: the mounting of the camera, where it is known. `None` without samples.
-    pub fn evaluate(mut self, body_from_camera: Option<&Isometry3<f64>>) -> Option<ImuInspection> {
+    /// Samples and reference poses in order of time.
+    pub fn sort(&mut self) {
         self.samples.sort_by_key(|sample| sample.stamp);
         self.truth.sort_by_key(|pose| pose.stamp);
+    }
+
+    pub fn samples(&self) -> &[ImuSample] {
+        &self.samples
+    }
+
+    /// What the samples, once sorted, say. `body_from_camera`: the mounting of the camera, where it
+    /// is known; `seen`: poses of the IMU by the images. `None` without samples.
+    pub fn evaluate(
+        &self,
+        body_from_camera: Option<&Isometry3<f64>>,
+        seen: &[TruthPose],
+    ) -> Option<ImuInspection> {
         let quietest = self.quietest_window()?;
         let mean_norm = self.samples.iter().map(|s| s.specific_force.norm()).sum::<f64>()
             / self.samples.len() as f64;
         let at_rest = quietest.is_rest();
         let acceleration_norm = if at_rest { quietest.acceleration.norm() } else { mean_norm };
-        let accelerometer_unit = accelerometer_unit(acceleration_norm);
-        let fit = AccelerometerFit::new(&self.samples, &self.truth);
+        let by_truth = AccelerometerFit::new(&self.samples, &self.truth);
+        let by_images = || AccelerometerFit::new(&self.samples, seen);
+        let fit = by_truth.clone().map(|fit| (fit, Evidence::Truth));
+        let fit = fit.or_else(|| by_images().map(|fit| (fit, Evidence::Images)));
         let (gravity_sign, sign_from) = match (&fit, body_from_camera) {
-            (Some(fit), _) => (Sign::of(fit.scale), Evidence::Truth),
+            (Some((fit, evidence)), _) => (Sign::of(fit.scale), *evidence),
             (None, Some(mounting)) => sign_by_mounting(&quietest.acceleration, mounting),
             (None, None) => (Sign::Unknown, Evidence::None),
         };
@@ -158,12 +173,33 @@ impl Inertial {
             acceleration: quietest.acceleration.into(),
             acceleration_norm,
             angular_velocity: quietest.angular_velocity.into(),
-            accelerometer_unit,
+            accelerometer_unit: accelerometer_unit(acceleration_norm),
             gravity_sign,
             sign_from,
             gyroscope_unit: gyroscope_unit(&self.samples, &self.truth),
-            truth_up: fit.map(|fit| fit.up.into()),
+            truth_up: by_truth.filter(AccelerometerFit::feels_gravity).map(|fit| fit.up.into()),
+            is_zero: self.samples.iter().all(|sample| sample.specific_force.norm() == 0.0),
+            fit: fit.map(|(fit, _)| fit),
+            liveliest: self.liveliest(),
         })
+    }
+
+    /// Stamp (s) at which the span with the most turns begins.
+    fn liveliest(&self) -> f64 {
+        let energy = |sample: &ImuSample| sample.angular_velocity.norm_squared();
+        let (mut last, mut sum, mut best) = (0, 0.0, (0.0, 0));
+        for (first, sample) in self.samples.iter().enumerate() {
+            let inside = |s: &ImuSample| s.stamp.seconds_since(sample.stamp) < LIVELY_SPAN;
+            while let Some(next) = self.samples.get(last).filter(|next| inside(next)) {
+                sum += energy(next);
+                last += 1;
+            }
+            if sum > best.0 {
+                best = (sum, first);
+            }
+            sum -= energy(sample);
+        }
+        self.samples.get(best.1).map_or(0.0, |sample| sample.stamp.seconds())
     }
 
     fn quietest_window(&self) -> Option<Window> {
@@ -277,9 +313,16 @@ fn pose_at(truth: &[TruthPose], stamp: crate::sensor::Stamp) -> Option<Isometry3
 /// differences of its positions:
 ///
 /// `p(t + h) - 2 p(t) + p(t - h) = integral of (h - |s|) (scale R a(t + s) + g) ds`.
-struct AccelerometerFit {
-    scale: f64,
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct AccelerometerFit {
+    /// Factor that makes m/s^2 of the readings.
+    pub scale: f64,
+    /// Its standard deviation.
+    pub scale_sd: f64,
+    /// What the readings contain of gravity, m/s^2.
+    pub gravity: f64,
     /// Unit vector against gravity.
+    #[serde(skip)]
     up: Vector3<f64>,
 }
 
@@ -313,9 +356,21 @@ impl AccelerometerFit {
         let residual = squares - solution.dot(&right);
         let variance = squares - sum.norm_squared() / count;
         let gravity = Vector3::new(solution[1], solution[2], solution[3]);
-        let plausible = (gravity.norm() / STANDARD_GRAVITY - 1.0).abs() < TOLERANCE;
-        (plausible && residual < LARGEST_RESIDUAL * variance)
-            .then(|| Self { scale: solution[0], up: -gravity.normalize() })
+        // Three equations a window, four unknowns.
+        let noise = residual.max(0.0) / (3.0 * count - 4.0);
+        let scale_sd = (noise * normal.try_inverse()?[(0, 0)]).sqrt();
+        (residual < LARGEST_RESIDUAL * variance && scale_sd < LARGEST_SCALE_SD * solution[0].abs())
+            .then(|| Self {
+                scale: solution[0],
+                scale_sd,
+                gravity: gravity.norm(),
+                up: -gravity.normalize(),
+            })
+    }
+
+    /// Whether its direction of gravity means something.
+    fn feels_gravity(&self) -> bool {
+        self.gravity > LEAST_GRAVITY
     }
 }
 
@@ -370,13 +425,26 @@ fn gyroscope_unit(samples: &[ImuSample], truth: &[TruthPose]) -> GyroscopeUnit {
 
 #[cfg(test)]
 mod tests {
+    use super::super::findings::Findings;
+    use super::super::{Assumed, LogConfig, Severity, accelerometer};
     use super::*;
+    use crate::inertial::ImuConfig;
     use crate::sensor::Stamp;
     use crate::simulation::{Motion, MotionConfig, MotionKind};
 
     /// 10 s of a motion: samples times `scales` (accelerometer, gyroscope), reference in a world
     /// that is turned by `world`.
     fn recorded(kind: MotionKind, scales: [f64; 2], world: UnitQuaternion<f64>) -> Inertial {
+        recorded_under(9.81, kind, scales, world)
+    }
+
+    /// The same under another gravity, m/s^2.
+    fn recorded_under(
+        gravity: f64,
+        kind: MotionKind,
+        scales: [f64; 2],
+        world: UnitQuaternion<f64>,
+    ) -> Inertial {
         let config = MotionConfig { kind, ..MotionConfig::default() };
         let motion = Motion::built_in(&config, &Isometry3::identity(), 3);
         let mut inertial = Inertial::default();
@@ -386,7 +454,7 @@ mod tests {
             inertial.add_sample(ImuSample {
                 stamp,
                 angular_velocity: state.angular_velocity * scales[1],
-                specific_force: state.specific_force(9.81) * scales[0],
+                specific_force: state.specific_force(gravity) * scales[0],
             });
             let world_from_body =
                 Isometry3::from_parts(Default::default(), world) * state.world_from_body;
@@ -405,7 +473,7 @@ mod tests {
             (-1.0 / 9.81, AccelerometerUnit::StandardGravities, Sign::Inverted),
         ] {
             for kind in [MotionKind::LabSimple, MotionKind::LabMotion, MotionKind::LabBumper] {
-                let found = recorded(kind, [scale, 1.0], upside).evaluate(None).unwrap();
+                let found = recorded(kind, [scale, 1.0], upside).evaluate(None, &[]).unwrap();
                 assert_eq!(
                     (found.accelerometer_unit, found.gravity_sign),
                     (unit, sign),
@@ -414,9 +482,40 @@ mod tests {
                 assert_eq!(found.sign_from, Evidence::Truth);
                 let up = Vector3::from(found.truth_up.unwrap());
                 assert!(up.angle(&(upside * Vector3::z())) < 0.03, "{up}");
-                assert!((found.accelerometer_scale().unwrap() - 1.0 / scale).abs() < 1e-9);
+                let fit = found.fit.unwrap();
+                assert!((fit.scale * scale - 1.0).abs() < 0.05 && (fit.gravity - 9.81).abs() < 0.3);
             }
         }
+    }
+
+    /// What is said, and what is to be set, for readings of accelerations under a gravity.
+    fn judged(gravity: f64, scale: f64, imu: &ImuConfig) -> (Severity, Vec<String>, String) {
+        let identity = UnitQuaternion::identity();
+        let inertial = recorded_under(gravity, MotionKind::LabMotion, [scale, 1.0], identity);
+        let found = inertial.evaluate(None, &[]).unwrap();
+        let mut findings = Findings::default();
+        accelerometer::judge(&mut findings, &found, &Assumed::new(&LogConfig::default(), imu));
+        let settings = findings.0.iter().filter_map(|finding| finding.setting.clone()).collect();
+        let worst = findings.0.iter().map(|finding| finding.severity).max().unwrap();
+        let text = findings.0.iter().map(|f| f.message.clone()).collect::<Vec<_>>().join("; ");
+        (worst, settings, text)
+    }
+
+    #[test]
+    fn another_gravity_is_told_from_another_unit_by_accelerations() {
+        let earth = ImuConfig { gravity: 9.81, ..ImuConfig::default() };
+        let moon = ImuConfig { gravity: 1.62, ..ImuConfig::default() };
+        assert_eq!(judged(9.81, 1.0, &earth).1, [""; 0]);
+        assert_eq!(judged(1.62, 1.0, &moon).1, [""; 0]);
+        let (_, settings, text) = judged(1.62, 1.0, &earth);
+        assert_eq!(settings, ["imu.gravity=1.62"], "{text}");
+        // A scale of six has the same norm at rest.
+        let (_, settings, text) = judged(9.81, 1.62 / 9.81, &earth);
+        assert_eq!(settings, ["imu.accelerometer_scale=6.056"], "{text}");
+        let (_, settings, text) = judged(9.81, 1.04, &earth);
+        assert_eq!(settings, ["imu.accelerometer_scale=0.9615"], "{text}");
+        let (worst, _, text) = judged(0.0, 1.0, &earth);
+        assert!(worst == Severity::Error && text.contains("gravity has been taken out"), "{text}");
     }
 
     #[test]
@@ -428,7 +527,7 @@ mod tests {
         ] {
             let identity = UnitQuaternion::identity();
             let inertial = recorded(MotionKind::LabMotion, [1.0, scale], identity);
-            assert_eq!(inertial.evaluate(None).unwrap().gyroscope_unit, unit);
+            assert_eq!(inertial.evaluate(None, &[]).unwrap().gyroscope_unit, unit);
         }
     }
 
@@ -439,14 +538,14 @@ mod tests {
         inertial.truth.clear();
         let samples = inertial.samples.clone();
         // The simulated camera starts upright.
-        let found = inertial.evaluate(Some(&Isometry3::identity())).unwrap();
+        let found = inertial.evaluate(Some(&Isometry3::identity()), &[]).unwrap();
         assert!(found.at_rest && (found.acceleration_norm - 1.0).abs() < 0.01);
         assert_eq!(
             (found.gravity_sign, found.sign_from),
             (Sign::Inverted, Evidence::CameraMounting)
         );
         assert_eq!(found.gyroscope_unit, GyroscopeUnit::Unknown);
-        let unmounted = Inertial { samples, truth: Vec::new() }.evaluate(None).unwrap();
+        let unmounted = Inertial { samples, truth: Vec::new() }.evaluate(None, &[]).unwrap();
         assert_eq!((unmounted.gravity_sign, unmounted.sign_from), (Sign::Unknown, Evidence::None));
     }
 
@@ -456,7 +555,7 @@ mod tests {
         // Poses of another recording.
         let other = recorded(MotionKind::Corridor, [1.0, 1.0], UnitQuaternion::identity());
         inertial.truth = other.truth;
-        let found = inertial.evaluate(None).unwrap();
+        let found = inertial.evaluate(None, &[]).unwrap();
         assert_eq!(
             (found.sign_from, found.gyroscope_unit),
             (Evidence::None, GyroscopeUnit::Unknown)
@@ -467,9 +566,9 @@ mod tests {
     fn a_moving_imu_is_not_at_rest() {
         let mut inertial = recorded(MotionKind::LabMotion, [1.0, 1.0], UnitQuaternion::identity());
         inertial.samples.drain(..400);
-        let found = inertial.evaluate(None).unwrap();
+        let found = inertial.evaluate(None, &[]).unwrap();
         assert!(!found.at_rest);
         assert_eq!(found.accelerometer_unit, AccelerometerUnit::MetresPerSecondSquared);
-        assert!(Inertial::default().evaluate(None).is_none());
+        assert!(Inertial::default().evaluate(None, &[]).is_none());
     }
 }

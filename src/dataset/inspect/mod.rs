@@ -1,11 +1,15 @@
 //! What is in a log, and whether it is fit for visual-inertial odometry.
 //!
-//! The whole log is read, but only one image in ten is decoded.
+//! The whole log is read, but only one image in ten is decoded. What needs an estimator, which this
+//! module does not know, is added by [`Inspection::with_camera_track`] and
+//! [`Inspection::with_trial`].
 
+mod accelerometer;
 mod findings;
 mod images;
 mod inertial;
 mod timing;
+mod turns;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -25,15 +29,18 @@ use super::open::{Contents, MessageLog};
 use super::pair::{Paired, Pairer};
 use super::pixels::Rejection;
 use super::ros::{ImageHead, ImuContent, Message, Role, Survey};
-use super::{LogConfig, LogError, LogSummary, ReadReport};
+use super::{LogConfig, LogError, LogSummary, ReadReport, TruthPose};
 use crate::inertial::ImuConfig;
 use crate::sensor::{ColorImage, Stamp};
 use crate::vision::StereoRig;
 
 pub use findings::{Finding, Severity, Verdict};
 pub use images::{ColorInspection, DepthInspection};
-pub use inertial::{AccelerometerUnit, Evidence, GyroscopeUnit, ImuInspection, Sign};
+pub use inertial::{
+    AccelerometerFit, AccelerometerUnit, Evidence, GyroscopeUnit, ImuInspection, Sign,
+};
 pub use timing::{Gap, LogClock, Timing};
+pub use turns::TurnInspection;
 
 /// One image in this many is decoded.
 const STRIDE: u64 = 10;
@@ -45,7 +52,33 @@ pub struct Assumed<'a> {
     pub imu: &'a ImuConfig,
     /// Where it is known to be that of this log's camera.
     pub body_from_camera: Option<Isometry3<f64>>,
+    /// Added to camera stamps to bring them to the IMU's clock, s.
+    pub time_offset: f64,
+    /// Keys of the calibration that nothing gives.
+    pub missing: Vec<&'static str>,
 }
+
+impl<'a> Assumed<'a> {
+    /// Of a log whose camera is not known.
+    pub fn new(log: &'a LogConfig, imu: &'a ImuConfig) -> Self {
+        Self { log, imu, body_from_camera: None, time_offset: 0.0, missing: Vec::new() }
+    }
+}
+
+/// What came of starting the estimator on the log.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Trial {
+    /// Frames that it was given.
+    pub frames: u64,
+    pub processed: u64,
+    /// Why it processed none.
+    pub reason: Option<String>,
+    /// Advised settings with which it ran.
+    pub settings: Vec<String>,
+}
+
+/// Length of the span over which the turns of images and gyroscope are to be compared, s.
+pub const TURN_SPAN: f64 = inertial::LIVELY_SPAN;
 
 /// What is in a log. Times are in seconds.
 #[derive(Debug, Clone, Serialize)]
@@ -59,10 +92,16 @@ pub struct Inspection {
     pub depth: Option<DepthInspection>,
     pub pairs: PairInspection,
     pub imu: Option<ImuInspection>,
+    /// Turns of the images against those of the gyroscope.
+    pub turns: Option<TurnInspection>,
+    /// The estimator's start.
+    pub trial: Option<Trial>,
     /// Messages that could not be used, by reason.
     pub skipped: BTreeMap<String, u64>,
     pub findings: Vec<Finding>,
     pub verdict: Verdict,
+    #[serde(skip)]
+    inertial: Inertial,
 }
 
 /// One topic, or one kind of file of a folder.
@@ -322,6 +361,8 @@ impl Inspector {
         };
         let first = timings().map(|timing| timing.first).fold(f64::INFINITY, f64::min);
         let last = timings().map(|timing| timing.last).fold(f64::NEG_INFINITY, f64::max);
+        self.inertial.sort();
+        let imu = self.inertial.evaluate(assumed.body_from_camera.as_ref(), &[]);
         let mut inspection = Inspection {
             summary,
             duration: (last - first).max(0.0),
@@ -329,17 +370,54 @@ impl Inspector {
             color: self.color.evaluate(),
             depth: self.depth.evaluate(),
             pairs: self.pairs,
-            imu: self.inertial.evaluate(assumed.body_from_camera.as_ref()),
+            imu,
+            turns: None,
+            trial: None,
             skipped: self.report.skipped,
             findings: Vec::new(),
             verdict: Verdict::default(),
+            inertial: self.inertial,
         };
-        (inspection.findings, inspection.verdict) = findings::judge(&inspection, assumed);
+        inspection.judge(assumed);
         inspection
     }
 }
 
 impl Inspection {
+    fn judge(&mut self, assumed: &Assumed) {
+        (self.findings, self.verdict) = findings::judge(self, assumed);
+    }
+
+    /// Adds what poses of the camera, found from its images alone, say of the IMU: they need not be
+    /// of more than [`TURN_SPAN`].
+    pub fn with_camera_track(mut self, camera: &[TruthPose], assumed: &Assumed) -> Self {
+        self.turns = TurnInspection::of(camera, self.inertial.samples());
+        let Some(turns) = &self.turns else { return self };
+        let mounting = turns.mounting().map(|rotation| {
+            let place = assumed.body_from_camera.map(|known| known.translation);
+            Isometry3::from_parts(place.unwrap_or_default(), rotation)
+        });
+        if let Some(body_from_camera) = mounting {
+            let seen: Vec<TruthPose> = camera
+                .iter()
+                .map(|pose| TruthPose {
+                    stamp: pose.stamp.offset_by(turns.time_offset),
+                    world_from_body: pose.world_from_body * body_from_camera.inverse(),
+                })
+                .collect();
+            self.imu = self.inertial.evaluate(Some(&body_from_camera), &seen);
+        }
+        self.judge(assumed);
+        self
+    }
+
+    /// Adds what came of starting the estimator.
+    pub fn with_trial(mut self, trial: Trial, assumed: &Assumed) -> Self {
+        self.trial = Some(trial);
+        self.judge(assumed);
+        self
+    }
+
     /// What is known of the topic or list that plays a role (`color`, `depth`, `imu`, `truth`).
     pub fn topic(&self, role: &str) -> Option<&TopicInspection> {
         let source = self.summary.sources.get(role)?;
@@ -379,7 +457,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = samples::file(&folder, "log", bytes);
         let (log, imu) = (LogConfig::default(), ImuConfig::default());
-        inspect(&path, &Assumed { log: &log, imu: &imu, body_from_camera: None }).unwrap()
+        inspect(&path, &Assumed::new(&log, &imu)).unwrap()
     }
 
     #[test]

@@ -1,11 +1,21 @@
 //! The configuration of a run: one TOML file a sensor set-up, single keys overridden by `--set`.
+//!
+//! [`Resolved::of`] makes the configuration for a log, of layers: the defaults, the shipped file for
+//! the log's layout, what the log tells of its sensors, a given file, the command line. Each value
+//! knows its [`Origin`].
+
+mod resolve;
+
+pub mod import;
+
+pub mod import;
 
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::dataset::{LogConfig, LogSummary};
+use crate::dataset::{LogConfig, LogError};
 use crate::fault::FaultConfig;
 use crate::filter::FilterConfig;
 use crate::filter::attitude::AdaptiveConfig;
@@ -13,12 +23,12 @@ use crate::filter::gnss::GnssConfig;
 use crate::inertial::{ImuConfig, StandstillConfig};
 use crate::map::MapConfig;
 use crate::odometry::{HealthConfig, InitConfig, OdometryConfig, TruthConfig};
-use crate::sensor::CameraConfig;
+use crate::sensor::{Camera, CameraConfig, CameraError};
 use crate::tracking::SearchConfig;
 use crate::viewer::RecordingConfig;
-use crate::vision::{
-    DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig, rectified_camera,
-};
+use crate::vision::{DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig};
+
+pub use resolve::{Conflict, Origin, Resolved, Setting};
 
 /// Everything a replay can be told, by section.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -44,19 +54,23 @@ pub struct Config {
 }
 
 /// The configurations that come with the program, by the name a log's layout asks for.
-const SHIPPED: [(&str, &str); 5] = [
-    ("vcu_rvi", include_str!("../configs/vcu_rvi.toml")),
-    ("tum_rgbd", include_str!("../configs/tum_rgbd.toml")),
-    ("seven_scenes", include_str!("../configs/seven_scenes.toml")),
-    ("euroc", include_str!("../configs/euroc.toml")),
-    ("sim", include_str!("../configs/sim.toml")),
+const SHIPPED: [(&str, &str); 6] = [
+    ("vcu_rvi", include_str!("../../configs/vcu_rvi.toml")),
+    ("tum_rgbd", include_str!("../../configs/tum_rgbd.toml")),
+    ("seven_scenes", include_str!("../../configs/seven_scenes.toml")),
+    ("euroc", include_str!("../../configs/euroc.toml")),
+    ("sim", include_str!("../../configs/sim.toml")),
+    (GENERIC, include_str!("../../configs/generic.toml")),
 ];
 
+/// The configuration of sensors that are not known: without the calibration of a camera.
+const GENERIC: &str = "generic";
+
 /// The configuration of `gnss` where none is given.
-const GNSS: &str = include_str!("../configs/kitti.toml");
+const GNSS: &str = include_str!("../../configs/kitti.toml");
 
 /// The configuration of `attitude` where none is given.
-const ATTITUDE: &str = include_str!("../configs/attitude.toml");
+const ATTITUDE: &str = include_str!("../../configs/attitude.toml");
 
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
@@ -72,6 +86,10 @@ pub enum ConfigError {
     NotShipped { name: String },
     #[error("`--set {text}` is not of the form SECTION.KEY=VALUE")]
     Override { text: String },
+    #[error(transparent)]
+    Log(#[from] LogError),
+    #[error("{log}: {reason}")]
+    NoCalibration { log: PathBuf, reason: String },
 }
 
 fn suggestion(nearest: &Option<String>) -> String {
@@ -85,51 +103,35 @@ pub fn shipped_names() -> Vec<&'static str> {
 impl Config {
     /// The configuration that is shipped under `name`, with `overrides` (`section.key=value`).
     pub fn shipped(name: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        parse(shipped_text(name)?, &format!("configs/{name}.toml"), overrides)
+        let origin = format!("configs/{name}.toml");
+        parse::<Self>(shipped_text(name)?, &origin, overrides)?.checked(&origin)
     }
 
-    /// The configuration for a log, with `overrides`: that of `file`, or the shipped one for the
-    /// log's layout with the camera's calibration where the log tells it. Where depth comes from
-    /// two cameras, their rectified image has the calibration that follows from theirs.
-    pub fn for_log(
-        log: &LogSummary,
-        file: Option<&Path>,
-        overrides: &[String],
-    ) -> Result<Self, ConfigError> {
-        let (text, origin) = match file {
-            Some(path) => (read(path)?, path.display().to_string()),
-            None => {
-                let name = &log.config_name;
-                (shipped_text(name)?.to_owned(), format!("configs/{name}.toml"))
-            }
-        };
-        let given: Self = parse(&text, &origin, overrides)?;
-        let told = log.camera.clone().filter(|_| file.is_none() || log.is_stereo());
-        let Some(camera) = told.or(given.rectified_camera(log, &origin)?) else {
-            return Ok(given);
-        };
-        // Keys that are set by hand count more than what the log tells.
-        let without_overrides: Self = parse(&text, &origin, &[])?;
-        let text = toml::to_string(&Self { camera, ..without_overrides }).map_err(|error| {
-            ConfigError::Syntax { origin: origin.clone(), message: error.to_string() }
-        })?;
-        parse(&text, &origin, overrides)
+    /// A configuration file's text; keys that it leaves out have their defaults.
+    pub fn from_toml(text: &str) -> Result<Self, ConfigError> {
+        parse::<Self>(text, "configuration", &[])?.checked("configuration")
     }
 
-    /// Where depth comes from two image topics.
-    fn rectified_camera(
-        &self,
-        log: &LogSummary,
-        origin: &str,
-    ) -> Result<Option<CameraConfig>, ConfigError> {
-        let is_named = !["", "none"].contains(&self.log.right_topic.as_str());
-        let is_stereo = is_named || log.is_stereo() && self.log.depth_topic.is_empty();
-        let ([left, right], true) = (&self.log.stereo[..], is_stereo) else { return Ok(None) };
-        rectified_camera(left, right).map(Some).map_err(|error| ConfigError::BadValue {
-            origin: origin.to_owned(),
-            key: "log.stereo".to_owned(),
-            message: error.to_string(),
-        })
+    /// Itself if its cameras are possible ones.
+    fn checked(self, origin: &str) -> Result<Self, ConfigError> {
+        let check = |section: &str, camera: &CameraConfig| {
+            camera.validate().map_err(|error| ConfigError::BadValue {
+                origin: origin.to_owned(),
+                key: format!("{section}.{}", error.key()),
+                message: error.to_string(),
+            })
+        };
+        check("camera", &self.camera)?;
+        self.log.stereo.iter().try_for_each(|camera| check("log.stereo", camera))?;
+        Ok(self)
+    }
+
+    /// The camera, with depth as it is measured.
+    ///
+    /// # Errors
+    /// See [`CameraConfig::validate`].
+    pub fn lens(&self) -> Result<Camera, CameraError> {
+        Ok(Camera::new(&self.camera)?.with_depth(self.depth.along))
     }
 
     /// The sections that the pipeline behind the front end needs.
@@ -215,6 +217,13 @@ fn table(text: &str, origin: &str) -> Result<toml::Table, ConfigError> {
     })
 }
 
+/// The tables of a TOML text, once all of its keys are known.
+fn table_of(text: &str, origin: &str, valid: &[String]) -> Result<toml::Table, ConfigError> {
+    let table = table(text, origin)?;
+    check_keys(&table, valid, origin)?;
+    Ok(table)
+}
+
 fn parse_table<T>(
     mut table: toml::Table,
     origin: &str,
@@ -226,8 +235,13 @@ where
     let valid = valid_keys::<T>()?;
     check_keys(&table, &valid, origin)?;
     for text in overrides {
-        apply(&mut table, text, &valid)?;
+        let (key, value) = assignment(text, &valid)?;
+        put(&mut table, &key, value);
     }
+    typed(table, origin)
+}
+
+fn typed<T: DeserializeOwned>(table: toml::Table, origin: &str) -> Result<T, ConfigError> {
     serde_path_to_error::deserialize(toml::Value::Table(table)).map_err(|error| {
         ConfigError::BadValue {
             origin: origin.to_owned(),
@@ -279,26 +293,38 @@ fn plain_value(text: &str) -> toml::Value {
     number.map_or_else(|| toml::Value::String(text.to_owned()), toml::Value::Float)
 }
 
-/// Sets one key from `section.key=value`; a value that is neither TOML nor a number is taken as a
+/// Key and value of `section.key=value`; a value that is neither TOML nor a number is taken as a
 /// string.
-fn apply(table: &mut toml::Table, text: &str, valid: &[String]) -> Result<(), ConfigError> {
+fn assignment(text: &str, valid: &[String]) -> Result<(String, toml::Value), ConfigError> {
     let malformed = || ConfigError::Override { text: text.to_owned() };
     let (path, value) = text.split_once('=').ok_or_else(malformed)?;
-    let (section, key) = path.trim().split_once('.').ok_or_else(malformed)?;
-    check_key(path.trim(), valid, "--set")?;
+    let path = path.trim();
+    if !path.contains('.') {
+        return Err(malformed());
+    }
+    check_key(path, valid, "--set")?;
     let value = format!("value = {value}")
         .parse::<toml::Table>()
         .ok()
         .and_then(|mut parsed| parsed.remove("value"))
         .unwrap_or_else(|| plain_value(value.trim()));
+    Ok((path.to_owned(), value))
+}
+
+/// Sets `section.key` in a table of sections.
+fn put(table: &mut toml::Table, path: &str, value: toml::Value) {
+    let Some((section, key)) = path.split_once('.') else { return };
     let section =
         table.entry(section.to_owned()).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-    section.as_table_mut().ok_or_else(malformed)?.insert(key.to_owned(), value);
-    Ok(())
+    if let Some(section) = section.as_table_mut() {
+        section.insert(key.to_owned(), value);
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
 
     fn set(text: &str) -> Result<Config, ConfigError> {
@@ -311,31 +337,15 @@ mod tests {
         for (name, text) in SHIPPED {
             Config::shipped(name, &[]).unwrap();
             let given = flat_keys(&text.parse().unwrap());
-            let missing: Vec<_> = valid.iter().filter(|key| !given.contains(key)).collect();
-            assert!(missing.is_empty(), "{name}: {missing:?}");
+            let missing = valid.iter().filter(|key| !given.contains(key)).map(String::as_str);
+            // What has to come from the log or from a file of one's own is not made up.
+            let open = if name == GENERIC { resolve::CALIBRATION } else { &[][..] };
+            let open: BTreeSet<&str> = open.iter().copied().collect();
+            assert_eq!(missing.collect::<BTreeSet<_>>(), open, "{name}");
         }
         GnssConfig::shipped(&[]).unwrap();
         let given = flat_keys(&GNSS.parse().unwrap());
         assert_eq!(given.len(), valid_keys::<GnssConfig>().unwrap().len(), "{given:?}");
-    }
-
-    #[test]
-    fn two_cameras_decide_the_calibration_of_their_rectified_image() {
-        let shipped = Config::shipped("euroc", &[]).unwrap();
-        let [left, right] = &shipped.log.stereo[..] else { panic!("{:?}", shipped.log.stereo) };
-        let rectified = rectified_camera(left, right).unwrap();
-        let mounts = (rectified.imu_from_camera, shipped.camera.imu_from_camera);
-        for (computed, stated) in mounts.0.iter().flatten().zip(mounts.1.iter().flatten()) {
-            assert!((computed - stated).abs() < 1e-7, "{mounts:?}");
-        }
-        let mut log = LogSummary { config_name: "euroc".to_owned(), ..LogSummary::default() };
-        assert_eq!(Config::for_log(&log, None, &[]).unwrap().camera, shipped.camera);
-        log.sources.insert("right".to_owned(), "/cam1/image_raw".to_owned());
-        assert_eq!(Config::for_log(&log, None, &[]).unwrap().camera, rectified);
-        let overrides = ["camera.time_offset=0.01".to_owned()];
-        let fitted = Config::for_log(&log, None, &overrides).unwrap();
-        assert_eq!((fitted.camera.time_offset, fitted.camera.fx), (0.01, rectified.fx));
-        assert_eq!(fitted.log, shipped.log);
     }
 
     #[test]
