@@ -73,7 +73,10 @@ impl Results {
     /// is known by a name of its own.
     pub fn declare(&self, files: &mut Files, role: &str, directory: &Path, named: Option<&Path>) {
         let paths = self.names.iter().map(|name| directory.join(name));
-        for path in paths.filter(|path| named != Some(&resolved(path))) {
+        let is_named = |path: &Path| {
+            path.extension().is_some_and(|e| e == "rrd") && named == Some(&resolved(path))
+        };
+        for path in paths.filter(|path| !is_named(path)) {
             files.writes(role, &path);
         }
         if self.has_runs {
