@@ -309,5 +309,5 @@ fn an_interrupted_log_is_whole_up_to_there() {
     let errors = String::from_utf8(output.stderr).unwrap();
     assert!(errors.contains("complete up to there"), "{errors}");
     let info = json(&["info", text(&out), "--json"]);
-    assert!(info["duration"].as_f64().unwrap() > 0.5, "{info}");
+    assert!(info["pairs"]["frames"].as_u64().unwrap() > 0, "{info}");
 }

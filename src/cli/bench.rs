@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context;
 use indicatif::ProgressBar;
 
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::terminal::{INTERRUPTED, catch_interrupts, progress, tell};
 use mfg_vio::bench::{
     Axis, BenchError, BenchReport, BenchRequest, Dataset, Guard, Plan, Progress, Store, Workshop,
     execute, findings_table, plan, report, rows, sweep_figure,
@@ -127,7 +127,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
     let found = Guard::of(&command_line(), &runs);
     if let Some(path) = &args.write_guard {
         found.write(path)?;
-        eprintln!("stored: {}", path.display());
+        tell(&format!("stored: {}", path.display()));
     }
     stored.map_or(Ok(()), |stored| judge(&stored, &found))
 }
@@ -211,7 +211,7 @@ fn judge(stored: &Guard, found: &Guard) -> anyhow::Result<()> {
     let findings = stored.compare(found);
     let worse = findings.iter().filter(|finding| finding.worse).count();
     if !findings.is_empty() {
-        eprint!("{}", findings_table(&findings).to_text());
+        tell(findings_table(&findings).to_text().trim_end());
     }
     anyhow::ensure!(
         worse == 0,

@@ -9,8 +9,18 @@ use mfg_vio::output::{Files, resolved};
 use super::results::Results;
 
 /// Arguments that name what is written; all other paths are read.
-const OUTPUTS: [&str; 8] =
-    ["out", "output", "rrd", "plot", "report", "save_map", "write_config", "write_calibration"];
+const OUTPUTS: [&str; 10] = [
+    "cache",
+    "out",
+    "output",
+    "plot",
+    "report",
+    "rrd",
+    "save_map",
+    "write_calibration",
+    "write_config",
+    "write_guard",
+];
 /// Arguments that name logs. If they are folders, nothing is written into them.
 const LOGS: [&str; 3] = ["log", "input", "root"];
 
@@ -36,7 +46,7 @@ pub fn prepare(command: &Command, matches: &ArgMatches) -> anyhow::Result<()> {
                     files.reads_from(&role, value);
                 }
             } else if is_directory(argument) {
-                let results = Results::of(&path);
+                let results = if id == "out" { Results::of(&path) } else { Results::runs() };
                 results.declare(&mut files, &role, value, recording.as_deref());
                 earlier.push((results, value.clone()));
             } else {
@@ -91,7 +101,8 @@ mod tests {
     use super::*;
 
     /// Arguments that name files which are read, beside [`LOGS`].
-    const INPUTS: [&str; 11] = [
+    const INPUTS: [&str; 12] = [
+        "guard",
         "config",
         "directories",
         "directory",

@@ -68,7 +68,7 @@ pub struct WrongUsage(pub String);
 /// 128 + n after signal n.
 pub fn main() -> ExitCode {
     let command = Cli::command();
-    let arguments = with_whole_numbers(std::env::args_os());
+    let arguments = with_plain_numbers(std::env::args_os());
     let parsed = command
         .clone()
         .try_get_matches_from(arguments)
@@ -90,16 +90,18 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// Puts the zero before the point of `-.5`, which the parser would take for a flag.
-fn with_whole_numbers(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
-    let whole = |argument: OsString| {
-        let digits = argument.to_str().and_then(|text| text.strip_prefix("-."));
-        match digits.filter(|digits| digits.starts_with(|c: char| c.is_ascii_digit())) {
-            Some(digits) => format!("-0.{digits}").into(),
+/// Writes negative numbers such as `-.5` and `-5e-1`, which the parser would take for flags, as
+/// `-0.5`.
+fn with_plain_numbers(arguments: impl Iterator<Item = OsString>) -> Vec<OsString> {
+    let plain = |argument: OsString| {
+        let text = argument.to_str().filter(|text| text.starts_with('-'));
+        let number = text.and_then(|text| text.parse::<f64>().ok());
+        match number.filter(|number| number.is_finite()) {
+            Some(number) => number.to_string().into(),
             None => argument,
         }
     };
-    arguments.map(whole).collect()
+    arguments.map(plain).collect()
 }
 
 fn run(command: Command) -> anyhow::Result<()> {

@@ -20,10 +20,15 @@ const DEMO: [&str; 8] = [
 const ATTITUDE: [&str; 1] = ["attitude.csv"];
 const GNSS: [&str; 2] = ["trajectory.tum", "state.csv"];
 
+const BENCH: [&str; 5] =
+    ["results.json", "results.csv", "results.tex", "results.html", "sweep.svg"];
+
 /// The files of a command's `--out DIR`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Results {
     names: Vec<&'static str>,
+    /// Whether those of an earlier run are of no use to this one.
+    are_replaced: bool,
     /// Whether there are sub-directories with results, too.
     has_runs: bool,
 }
@@ -31,17 +36,28 @@ pub struct Results {
 impl Results {
     pub fn of(command: &str) -> Self {
         // Of a command that is not known anything may be expected.
-        Self::known(command).unwrap_or(Self { names: Vec::new(), has_runs: true })
+        Self::known(command).unwrap_or(Self::runs())
+    }
+
+    /// Sub-directories that stay.
+    pub fn runs() -> Self {
+        Self { names: Vec::new(), are_replaced: false, has_runs: true }
     }
 
     fn known(command: &str) -> Option<Self> {
-        let named = |names: &[&'static str]| Self { names: names.to_vec(), has_runs: false };
+        let named = |names: &[&'static str]| Self {
+            names: names.to_vec(),
+            are_replaced: true,
+            has_runs: false,
+        };
         Some(match command {
             "replay" => named(&replay::RESULTS),
             "demo" => named(&[&replay::RESULTS[..], &DEMO].concat()),
             "attitude" => named(&ATTITUDE),
             "gnss" => named(&GNSS),
-            "faults" | "bench" => Self { names: Vec::new(), has_runs: true },
+            "faults" => Self::runs(),
+            // It goes on with the runs that there are.
+            "bench" => Self { are_replaced: false, has_runs: true, ..named(&BENCH) },
             // Named by the study; nothing is read.
             "experiment" => named(&[]),
             _ => return None,
@@ -57,7 +73,10 @@ impl Results {
     /// is known by a name of its own.
     pub fn declare(&self, files: &mut Files, role: &str, directory: &Path, named: Option<&Path>) {
         let paths = self.names.iter().map(|name| directory.join(name));
-        for path in paths.filter(|path| named != Some(&resolved(path))) {
+        let is_named = |path: &Path| {
+            path.extension().is_some_and(|e| e == "rrd") && named == Some(&resolved(path))
+        };
+        for path in paths.filter(|path| !is_named(path)) {
             files.writes(role, &path);
         }
         if self.has_runs {
@@ -70,7 +89,8 @@ impl Results {
     /// # Errors
     /// If a file cannot be removed.
     pub fn remove(&self, directory: &Path) -> anyhow::Result<()> {
-        for path in self.names.iter().map(|name| directory.join(name)) {
+        let names = self.names.iter().filter(|_| self.are_replaced);
+        for path in names.map(|name| directory.join(name)) {
             match std::fs::remove_file(&path) {
                 Err(error) if !is_absent(&error) => {
                     return Err(error).with_context(|| format!("{}", path.display()));

@@ -47,10 +47,12 @@ enum Prepared {
 }
 
 impl Prepared {
-    fn stamp(&self) -> Stamp {
+    /// Of a sensor's own reading: a reference may be of any time, a repetition is of an old one.
+    fn measured_at(&self) -> Option<Stamp> {
         match self {
-            Self::Other(event) => event.stamp(),
-            Self::Frame(frame) => frame.frame.stamp,
+            Self::Other(Event::Imu(sample)) => Some(sample.stamp),
+            Self::Other(_) => None,
+            Self::Frame(frame) => Some(frame.frame.stamp),
         }
     }
 }
@@ -103,8 +105,9 @@ pub fn run(
     let events = Clipped { events, options, first: None, started: false };
     let mut last = None;
     let mut feed = |prepared: Prepared| {
-        let stamp = prepared.stamp();
-        if let Some(reason) = last.replace(stamp).and_then(|last| new_run(last, stamp)) {
+        let before = last;
+        last = prepared.measured_at().or(last);
+        if let Some(reason) = before.zip(last).and_then(|(last, stamp)| new_run(last, stamp)) {
             odometry.end();
             show(odometry, &mut observe);
             odometry.begin_new_run(reason);

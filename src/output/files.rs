@@ -125,8 +125,10 @@ impl Files {
             if *target == Target::File && output.path.is_dir() {
                 return Err(FilesError::IsDirectory { output: FileNamed::clone(output) });
             }
-            if let Some((first, ..)) = outputs[..k].iter().find(|(_, _, first)| first.meets(place))
-            {
+            let is_twice = |first: &Place, of: Target| {
+                of == Target::File && *target == Target::File && first.meets(place)
+            };
+            if let Some((first, ..)) = outputs[..k].iter().find(|(_, of, p)| is_twice(p, *of)) {
                 let (first, second) = (FileNamed::clone(first), FileNamed::clone(output));
                 return Err(FilesError::Twice { first, second });
             }
@@ -346,5 +348,9 @@ mod tests {
             files.check().is_ok()
         };
         assert!(below("log.mcap") && !below("rec/data/1.png"));
+        let mut files = Files::new();
+        files.writes("--out", &path.join("results.json"));
+        files.writes_below("--out", path).writes_below("--cache", path);
+        assert!(files.check().is_ok());
     }
 }

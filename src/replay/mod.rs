@@ -395,7 +395,11 @@ impl Iterator for EventSource<'_> {
     }
 }
 
-/// Given poses by the clocks of a log with faults, the first event of which is at `first`.
+/// Given poses further before the log than this say nothing of it, s.
+const EARLIEST_REFERENCE: f64 = 1.0;
+
+/// Given poses by the clocks of a log with faults, the first event of which is at `first`, but for
+/// those long before it.
 fn faulty(
     poses: impl Iterator<Item = TruthPose>,
     faults: &[Fault],
@@ -408,7 +412,8 @@ fn faulty(
         });
         Some(TruthPose { stamp: stamp?, ..pose })
     };
-    poses.filter_map(by_clock).collect::<Vec<_>>().into_iter()
+    let is_near = |pose: &TruthPose| first.seconds_since(pose.stamp) < EARLIEST_REFERENCE;
+    poses.filter_map(by_clock).filter(is_near).collect::<Vec<_>>().into_iter()
 }
 
 /// What is gathered while the frames go by.

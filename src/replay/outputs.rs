@@ -208,15 +208,15 @@ fn optional_field(value: Option<f64>) -> String {
     value.map(|v| format!("{v:.9e}")).unwrap_or_default()
 }
 
-/// ASCII PLY of the map points: position (m, world), `sigma` (m), `age` (frames).
 /// One JSON object: the faults of the run in order of their end.
 fn write_faults(path: &Path, faults: &[Episode]) -> Result<(), ReplayError> {
     let failed = |source| ReplayError::Write { path: path.to_owned(), source };
     let object = serde_json::json!({ "faults": faults });
     let text = serde_json::to_string_pretty(&object).map_err(|error| failed(error.into()))?;
-    std::fs::write(path, text + "\n").map_err(failed)
+    crate::output::write(path, text + "\n").map_err(failed)
 }
 
+/// ASCII PLY of the map points: position (m, world), `sigma` (m), `age` (frames).
 fn write_map(path: &Path, map: &[MapPointView]) -> Result<(), ReplayError> {
     let mut text = format!("ply\nformat ascii 1.0\nelement vertex {}\n", map.len());
     for property in ["float x", "float y", "float z", "float sigma", "uint age"] {
