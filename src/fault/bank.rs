@@ -244,12 +244,12 @@ impl Monitors {
         {
             let verdict = self.turns.observe(at, &turn);
             self.hear(verdict);
+            if verdict.finding().is_some() {
+                self.distrust(at.offset_by(Self::DISTRUST));
+            }
         }
         if let Some(offset) = self.turns.take_offset().filter(|_| !self.clock.is_in_doubt()) {
             self.clock.suspect(offset, at);
-        }
-        if self.turns.is_open() {
-            self.distrust(at.offset_by(Self::DISTRUST));
         }
         let sighting = Sighting {
             world_from_body,

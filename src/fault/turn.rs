@@ -145,11 +145,6 @@ impl TurnContradiction {
         self.variance
     }
 
-    /// Whether gyroscope and images contradict each other and it is not known why.
-    pub fn is_open(&self) -> bool {
-        self.open
-    }
-
     /// Whether the body has turned enough to know that the gyroscope reads turns.
     pub fn knows_scale(&self) -> bool {
         self.agreed > Self::KNOWN * self.variance
