@@ -49,6 +49,7 @@ impl StreamMonitors {
 /// and [`Self::trust`] say.
 #[derive(Debug, Clone)]
 pub struct Monitors {
+    config: FaultConfig,
     imu_config: ImuConfig,
     imu: StreamMonitors,
     frames: StreamMonitors,
@@ -91,6 +92,7 @@ impl Monitors {
 
     pub fn new(config: &FaultConfig, imu: &ImuConfig) -> Self {
         Self {
+            config: config.clone(),
             imu_config: imu.clone(),
             imu: StreamMonitors::new(config, Stream::Imu, imu.max_gap),
             frames: StreamMonitors::new(config, Stream::Frames, config.stall_time),
@@ -112,6 +114,13 @@ impl Monitors {
             distrusted_until: None,
             record: FaultRecord::new(config),
         }
+    }
+
+    /// What comes now is by other clocks: nothing that was usual counts any more.
+    pub fn begin_anew(&mut self) {
+        let fresh = Self::new(&self.config, &self.imu_config);
+        self.record.close();
+        *self = Self { record: self.record.clone(), ..fresh };
     }
 
     /// Keeps what a monitor says until the next decision: of one fault the strongest.
@@ -244,12 +253,12 @@ impl Monitors {
         {
             let verdict = self.turns.observe(at, &turn);
             self.hear(verdict);
+            if verdict.finding().is_some() {
+                self.distrust(at.offset_by(Self::DISTRUST));
+            }
         }
         if let Some(offset) = self.turns.take_offset().filter(|_| !self.clock.is_in_doubt()) {
             self.clock.suspect(offset, at);
-        }
-        if self.turns.is_open() {
-            self.distrust(at.offset_by(Self::DISTRUST));
         }
         let sighting = Sighting {
             world_from_body,

@@ -120,6 +120,8 @@ impl ClockJumps {
     const STEADY: u32 = 10;
     /// Shorter jumps do little harm, longer ones are gaps, s.
     const JUMPS: Range<f64> = 0.01..0.25;
+    /// Shorter ones of the IMU's stamps are lost samples far more often, s.
+    const LEAST_OF_IMU: f64 = 0.02;
     /// An interval this close to a whole number of usual ones may mean lost messages, as a share of one.
     const WHOLE: f64 = 0.1;
     /// Turns are compared over at least this time, s: poses scatter as much over any.
@@ -158,7 +160,7 @@ impl ClockJumps {
     }
 
     pub fn imu_interval(&mut self, at: Stamp, interval: &Interval) {
-        if let Some(jump) = Self::excess(interval) {
+        if let Some(jump) = Self::excess(interval).filter(|jump| *jump >= Self::LEAST_OF_IMU) {
             self.suspect(jump, at);
         }
     }

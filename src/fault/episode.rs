@@ -102,6 +102,12 @@ impl FaultRecord {
         }
     }
 
+    /// Ends all that goes on: what comes now is by another clock.
+    pub fn close(&mut self) {
+        self.closed.extend(self.open.drain(..).map(|(_, episode)| episode));
+        self.held.clear();
+    }
+
     fn close_quiet(&mut self, at: Stamp) {
         let quiet = self.config.quiet_time;
         let over = |last: &Stamp| at.seconds_since(*last) > quiet;

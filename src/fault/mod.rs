@@ -12,6 +12,7 @@
 mod attitude;
 mod bank;
 mod biases;
+mod causes;
 mod clock;
 mod episode;
 mod force;

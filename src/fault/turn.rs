@@ -2,6 +2,7 @@
 
 use nalgebra::Vector3;
 
+use super::causes::{Cause, Contradiction, Explained};
 use super::sequential::{Cusum, Decided, Sprt, cusum_threshold};
 use super::{Fault, FaultConfig, Finding, Monitor, SUSPICIOUS, Verdict};
 use crate::inertial::ImuConfig;
@@ -21,33 +22,10 @@ pub struct Turn {
 }
 
 impl Turn {
-    fn residual(&self) -> Vector3<f64> {
+    pub(super) fn residual(&self) -> Vector3<f64> {
         self.seen - self.felt
     }
 }
-
-/// What explains the residuals `r = seen - felt` of the frames since a contradiction began.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Cause {
-    /// `r = 0`: there was none.
-    Nothing,
-    /// `r(k) = e`, `r(k+1) = -e`: one attitude was wrong.
-    WrongAttitude,
-    /// `r(k) = e` and nothing after it: the body was turned unseen.
-    Impulse,
-    /// `r = -b T`: the bias has changed by `b` (rad/s).
-    Bias(Vector3<f64>),
-    /// `felt = c seen`: the gyroscope reads `c` times the turn.
-    Scale(f64),
-    /// `r = t (rate(k) - rate(k-1))`: the stamps are off by `t` (s).
-    Clock(f64),
-    /// `r` of any size: noise, or images that show something else.
-    Anything,
-}
-
-/// A cause and how well it explains the residuals: `-2 ln` likelihood, with `ln(3 n)` for each of its
-/// parameters (Schwarz 1978).
-type Explained = (Cause, f64);
 
 /// Tells what is wrong when gyroscope and images contradict each other.
 ///
@@ -64,17 +42,15 @@ type Explained = (Cause, f64);
 #[derive(Debug, Clone)]
 pub struct TurnContradiction {
     config: FaultConfig,
-    /// White noise of the gyroscope, rad/s/sqrt(Hz), and deviation of its bias, rad/s.
+    /// White noise of the gyroscope, rad/s/sqrt(Hz).
     gyro_noise: f64,
-    gyro_bias_sd: f64,
     /// Of a component of the residual, rad^2, and the turns that it was learned from.
     variance: f64,
     count: f64,
     bias: Option<Vector3<f64>>,
     sum: Cusum,
-    /// Turns since the contradiction began, before one does the last ones, with the variance of the
-    /// residual's components.
-    window: Vec<(Turn, f64)>,
+    /// Before a contradiction begins: the last turns.
+    window: Contradiction,
     since: Option<Stamp>,
     open: bool,
     /// Factor on the readings, and the test that ends it.
@@ -95,25 +71,14 @@ impl TurnContradiction {
     /// Variance with a fault, as a multiple of the usual; degrees of freedom of both densities.
     const RAISED: f64 = 9.0;
     const DOF: f64 = 4.0;
-    /// Shift that is looked into (chi-square, 3 degrees of freedom: 1e-8), and frames it is looked for in.
-    const SURPRISING: f64 = 40.0;
+    /// Frames in which a shift is looked for.
     const TRAILING: usize = 8;
     /// Frames from which a cause is looked for, and time after which none is, s.
     const SHORTEST: usize = 4;
     const LONGEST: f64 = 0.5;
-    /// Most that one frame may count against a cause.
-    const MOST: f64 = 60.0;
-    /// A scale that calibration leaves open is no fault: twice, or half.
-    const LEAST_SCALE: f64 = 2.0;
     /// The scale is known when the turns that both agree on, squared, add up to so many times the variance
     /// of one (a deviation of the scale of 10 %): at rest a bias in other units is only a large bias.
     const KNOWN: f64 = 100.0;
-    /// Change of the bias that is a fault, in deviations of its prior.
-    const LEAST_BIAS: f64 = 3.0;
-    /// A turn of the body that is one, rad.
-    const LEAST_IMPULSE: f64 = 0.05;
-    /// A clock that is off by less does little harm, s.
-    const LEAST_OFFSET: f64 = 0.01;
     /// Time over which the bias is followed, s.
     const BIAS_TIME: f64 = 5.0;
 
@@ -121,12 +86,11 @@ impl TurnContradiction {
         Self {
             config: config.clone(),
             gyro_noise: imu.gyro_noise,
-            gyro_bias_sd: imu.gyro_bias_sd.max(1e-4),
             variance: Self::USUAL_SD.powi(2),
             count: Self::PRIOR,
             bias: None,
             sum: Cusum::default(),
-            window: Vec::new(),
+            window: Contradiction { turns: Vec::new(), gyro_bias_sd: imu.gyro_bias_sd.max(1e-4) },
             since: None,
             open: false,
             wrong_scale: None,
@@ -143,11 +107,6 @@ impl TurnContradiction {
     /// Variance of a component of a turn between two images, rad^2.
     pub fn variance(&self) -> f64 {
         self.variance
-    }
-
-    /// Whether gyroscope and images contradict each other and it is not known why.
-    pub fn is_open(&self) -> bool {
-        self.open
     }
 
     /// Whether the body has turned enough to know that the gyroscope reads turns.
@@ -170,7 +129,7 @@ impl TurnContradiction {
     }
 
     fn close(&mut self) {
-        self.window.clear();
+        self.window.turns.clear();
         self.since = None;
         self.open = false;
         self.sum.reset();
@@ -205,7 +164,7 @@ impl TurnContradiction {
         let Some((scale, test)) = &mut self.wrong_scale else { return };
         let misfit = |scale: f64| {
             let variance = variance * scale.max(1.0).powi(2);
-            ((turn.felt - scale * turn.seen).norm_squared() / variance).min(Self::MOST)
+            ((turn.felt - scale * turn.seen).norm_squared() / variance).min(Contradiction::MOST)
         };
         if test.add(0.5 * (misfit(1.0) - misfit(*scale)).clamp(-3.0, 3.0)) == Some(Decided::Sound) {
             self.wrong_scale = None;
@@ -216,133 +175,6 @@ impl TurnContradiction {
 
     fn finding(&self, fault: Fault, at: Stamp) -> Finding {
         Finding { fault, since: self.since.unwrap_or(at), statistic: 1.0 }
-    }
-
-    /// All explanations, the best one first.
-    fn explain(&self) -> [Explained; 7] {
-        let mut explained = [
-            (Cause::Nothing, self.cost(0, |_, turn| turn.residual())),
-            self.wrong_attitude(),
-            self.impulse(),
-            self.biased(),
-            self.scaled(),
-            self.mistimed(),
-            self.anything(),
-        ];
-        explained.sort_by(|a, b| a.1.total_cmp(&b.1));
-        explained
-    }
-
-    fn parameter(&self) -> f64 {
-        (3.0 * self.window.len() as f64).ln()
-    }
-
-    /// Of what is left of the residuals by a cause with so many parameters.
-    fn cost(&self, parameters: u32, left: impl Fn(usize, &Turn) -> Vector3<f64>) -> f64 {
-        let squares =
-            self.window.iter().enumerate().map(|(k, (turn, variance))| {
-                (left(k, turn).norm_squared() / variance).min(Self::MOST)
-            });
-        squares.sum::<f64>() + f64::from(parameters) * self.parameter()
-    }
-
-    /// The same of a cause that has to explain every frame: what leaves one surprising is no cause. One that
-    /// `lasts` may have begun in the course of the first.
-    fn full_cost(
-        &self,
-        lasts: bool,
-        parameters: u32,
-        left: impl Fn(usize, &Turn) -> Vector3<f64>,
-    ) -> f64 {
-        let frames = self.window.iter().enumerate().skip(usize::from(lasts));
-        let surprises = frames.filter(|(k, (turn, variance))| {
-            left(*k, turn).norm_squared() > Self::SURPRISING * variance
-        });
-        if surprises.count() > 0 { f64::INFINITY } else { self.cost(parameters, left) }
-    }
-
-    fn wrong_attitude(&self) -> Explained {
-        let residual =
-            |k: usize| self.window.get(k).map_or_else(Vector3::zeros, |(t, _)| t.residual());
-        let costs = (0..self.window.len()).map(|wrong| {
-            let error = 0.5 * (residual(wrong) - residual(wrong + 1));
-            self.cost(3, |k, turn| match k {
-                _ if k == wrong => turn.residual() - error,
-                _ if k == wrong + 1 => turn.residual() + error,
-                _ => turn.residual(),
-            })
-        });
-        (Cause::WrongAttitude, costs.fold(f64::INFINITY, f64::min))
-    }
-
-    fn impulse(&self) -> Explained {
-        let large = |k: &usize| self.window[*k].0.residual().norm() > Self::LEAST_IMPULSE;
-        let costs = (0..self.window.len()).filter(large).map(|hit| {
-            self.full_cost(
-                false,
-                3,
-                |k, turn| if k == hit { Vector3::zeros() } else { turn.residual() },
-            )
-        });
-        (Cause::Impulse, costs.fold(f64::INFINITY, f64::min))
-    }
-
-    fn biased(&self) -> Explained {
-        let (mut total, mut weight) = (Vector3::zeros(), 0.0);
-        for (turn, variance) in &self.window {
-            total -= turn.residual() * (turn.seconds / variance);
-            weight += turn.seconds.powi(2) / variance;
-        }
-        let bias: Vector3<f64> = total / weight;
-        let cost = match bias.norm() > Self::LEAST_BIAS * self.gyro_bias_sd {
-            true => self.full_cost(true, 3, |_, turn| turn.residual() + bias * turn.seconds),
-            false => f64::INFINITY,
-        };
-        (Cause::Bias(bias), cost)
-    }
-
-    /// The errors are those of the turns seen where `c > 1`, and of the readings where it is not.
-    fn scaled(&self) -> Explained {
-        let sum = |of: fn(&Turn) -> f64| self.window.iter().map(|(turn, _)| of(turn)).sum::<f64>();
-        let (both, seen, felt) = (
-            sum(|t| t.seen.dot(&t.felt)),
-            sum(|t| t.seen.norm_squared()),
-            sum(|t| t.felt.norm_squared()),
-        );
-        let scale = if felt > seen { felt / both } else { both / seen };
-        let wrong = !(1.0 / Self::LEAST_SCALE..Self::LEAST_SCALE).contains(&scale);
-        if !(wrong && scale > 0.0) {
-            return (Cause::Scale(scale), f64::INFINITY);
-        }
-        let cost = match scale > 1.0 {
-            true => self.full_cost(true, 1, |_, turn| turn.seen - turn.felt / scale),
-            // A bias is not scaled with the readings that it was learned from.
-            false => {
-                self.full_cost(true, 1, |_, turn| (turn.felt - scale * turn.seen) / scale.max(0.05))
-            }
-        };
-        (Cause::Scale(scale), cost)
-    }
-
-    fn mistimed(&self) -> Explained {
-        let (mut along, mut weight) = (0.0, 0.0);
-        for (turn, variance) in &self.window {
-            along += turn.residual().dot(&turn.rate_change) / variance;
-            weight += turn.rate_change.norm_squared() / variance;
-        }
-        let offset = if weight > 0.0 { along / weight } else { 0.0 };
-        let cost = match offset.abs() > Self::LEAST_OFFSET {
-            true => self.full_cost(true, 1, |_, turn| turn.residual() - turn.rate_change * offset),
-            false => f64::INFINITY,
-        };
-        (Cause::Clock(offset), cost)
-    }
-
-    fn anything(&self) -> Explained {
-        let components = 3.0 * self.window.len() as f64;
-        let square = |(turn, variance): &(Turn, f64)| turn.residual().norm_squared() / variance;
-        let mean = self.window.iter().map(square).sum::<f64>() / components;
-        (Cause::Anything, components * (1.0 + mean.max(1.0).ln()) + self.parameter())
     }
 
     /// Odds, as twice a logarithm, that leave a wrong decision with `miss_probability`.
@@ -369,19 +201,20 @@ impl TurnContradiction {
     /// Names the cause if it is clear, and acts on it: it beats all others by the odds that a wrong
     /// decision leaves, and `Nothing` by those that false alarms leave.
     fn decide(&mut self, at: Stamp, threshold: f64) -> Verdict {
-        let explained = self.explain();
+        let explained = self.window.explain();
         let [(cause, cost), (_, other), ..] = explained;
-        let turned: f64 = self.window.iter().map(|(turn, _)| turn.seen.norm_squared()).sum();
+        let turned: f64 = self.window.turns.iter().map(|(turn, _)| turn.seen.norm_squared()).sum();
         let harmless = matches!(cause, Cause::Nothing | Cause::WrongAttitude);
         let told = match cause {
             Cause::Bias(_) => self.knows_scale() || turned > Self::KNOWN * self.variance,
             _ => true,
         };
-        let nothing = self.cost(0, |_, turn| turn.residual());
+        let nothing = self.window.cost(0, |_, turn| turn.residual());
         let likely = harmless || told && nothing - cost >= 2.0 * threshold;
-        let enough = self.window.len() >= Self::SHORTEST;
+        let enough = self.window.turns.len() >= Self::SHORTEST;
         let clear = enough && other - cost >= self.odds() && likely;
-        let late = self.window.iter().map(|(turn, _)| turn.seconds).sum::<f64>() >= Self::LONGEST;
+        let late =
+            self.window.turns.iter().map(|(turn, _)| turn.seconds).sum::<f64>() >= Self::LONGEST;
         if !clear && !late {
             return self.suspicion(&explained, at);
         }
@@ -425,10 +258,10 @@ impl Monitor for TurnContradiction {
         let square = turn.residual().norm_squared() / variance;
         let threshold = cusum_threshold(self.config.false_alarms_per_hour, turn.seconds);
         let statistic = self.sum.add(at, Self::log_ratio(square), threshold);
-        self.window.push((*turn, variance));
+        self.window.turns.push((*turn, variance));
         if !self.open {
-            let excess = self.window.len().saturating_sub(Self::TRAILING);
-            self.window.drain(..excess);
+            let excess = self.window.turns.len().saturating_sub(Self::TRAILING);
+            self.window.turns.drain(..excess);
             self.open_if_contradicted(at, statistic);
         }
         if self.open {
@@ -446,18 +279,18 @@ impl TurnContradiction {
     fn open_if_contradicted(&mut self, at: Stamp, statistic: f64) {
         let (mut sum, mut seconds) = (Vector3::zeros(), 0.0);
         let (mut largest, mut first) = (0.0, (0, at));
-        for (k, (turn, variance)) in self.window.iter().enumerate().rev() {
+        for (k, (turn, variance)) in self.window.turns.iter().enumerate().rev() {
             sum += turn.residual() / variance.sqrt();
-            let shift = sum.norm_squared() / (self.window.len() - k) as f64;
+            let shift = sum.norm_squared() / (self.window.turns.len() - k) as f64;
             if shift > largest {
                 (largest, first) = (shift, (k, at.offset_by(-seconds)));
             }
             seconds += turn.seconds;
         }
-        if largest > Self::SURPRISING || statistic >= SUSPICIOUS {
+        if largest > Contradiction::SURPRISING || statistic >= SUSPICIOUS {
             self.open = true;
             self.since = Some(first.1);
-            self.window.drain(..first.0);
+            self.window.turns.drain(..first.0);
         }
     }
 }

@@ -147,7 +147,7 @@ impl Odometry {
             legacy.last_sample = None;
         }
         self.buffer.begin_anew();
-        self.supervisor.begin_anew(&self.config.faults, &self.config.imu);
+        self.supervisor.begin_anew();
         self.supervisor.warn(reason);
     }
 

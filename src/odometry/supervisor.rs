@@ -63,8 +63,8 @@ impl Supervisor {
     }
 
     /// What comes now is by other clocks: nothing that was usual counts any more.
-    pub fn begin_anew(&mut self, faults: &FaultConfig, imu: &ImuConfig) {
-        self.monitors = Monitors::new(faults, imu);
+    pub fn begin_anew(&mut self) {
+        self.monitors.begin_anew();
         self.sound = None;
         self.health.new_run();
     }
