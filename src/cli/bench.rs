@@ -1,10 +1,9 @@
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use indicatif::ProgressBar;
 
-use super::terminal::{INTERRUPTED, catch_interrupts, progress};
+use super::terminal::{INTERRUPTED, catch_interrupts, print, progress, tell};
 use mfg_vio::bench::{
     Axis, BenchError, BenchReport, BenchRequest, Dataset, Guard, Plan, Progress, Store, Workshop,
     execute, findings_table, plan, report, rows, sweep_figure,
@@ -123,11 +122,11 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         true => serde_json::to_string(&results)? + "\n",
         false => results.to_text(),
     };
-    std::io::stdout().write_all(output.as_bytes())?;
+    print(&output)?;
     let found = Guard::of(&command_line(), &runs);
     if let Some(path) = &args.write_guard {
         found.write(path)?;
-        eprintln!("stored: {}", path.display());
+        tell(&format!("stored: {}", path.display()));
     }
     stored.map_or(Ok(()), |stored| judge(&stored, &found))
 }
@@ -181,7 +180,7 @@ fn print_plan(plan: &Plan, json: bool) -> anyhow::Result<()> {
         }
         false => plan.runs.iter().map(|run| run.label()).collect::<Vec<_>>().join("\n"),
     };
-    Ok(writeln!(std::io::stdout(), "{output}")?)
+    print(&output)
 }
 
 fn save(out: &Path, results: &BenchReport) -> anyhow::Result<()> {
@@ -211,7 +210,7 @@ fn judge(stored: &Guard, found: &Guard) -> anyhow::Result<()> {
     let findings = stored.compare(found);
     let worse = findings.iter().filter(|finding| finding.worse).count();
     if !findings.is_empty() {
-        eprint!("{}", findings_table(&findings).to_text());
+        tell(findings_table(&findings).to_text().trim_end());
     }
     anyhow::ensure!(
         worse == 0,
