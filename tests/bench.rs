@@ -264,6 +264,21 @@ fn seven_scenes_without_stamps() {
     assert!(number(row, &["ape_m", "median"]) < 0.02, "{row:#}");
 }
 
+#[test]
+fn openloris_with_its_split_imu() {
+    let root = tempfile::tempdir().unwrap();
+    let mount = layouts::forward_mount(0.0);
+    let camera = layouts::camera_section(&mount, INTRINSICS);
+    let recording = layouts::render(&format!("duration = 3.0\n{SMALL}{camera}"));
+    layouts::openloris(&root.path().join("office1-1"), &recording, &mount, INTRINSICS);
+    let report =
+        bench(&root.path().join("cache"), &["openloris", text(root.path()), "--seeds", "1"]);
+    let row = row(&report, "office1-1");
+    assert!(number(row, &["coverage"]) > 0.95, "{row:#}");
+    assert!(number(row, &["ape_m", "median"]) < 0.02, "{row:#}");
+    assert_eq!(report["missing"].as_array().unwrap().len(), 21);
+}
+
 /// Recordings of the development data as far as they go.
 #[test]
 fn real_recordings() {

@@ -61,6 +61,8 @@ pub struct Sequence {
     pub name: String,
     pub source: Source,
     pub clock: Clock,
+    /// Whether one camera is all that may be used: a run that takes depth or a second one fails.
+    pub one_camera: bool,
     /// `SECTION.KEY=VALUE` that this recording needs, before those of the command line.
     pub settings: Vec<String>,
     /// Spans, s after the first message, in which something is wrong that should be named: a

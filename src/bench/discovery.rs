@@ -71,6 +71,7 @@ fn recording(dataset: Dataset, root: &Path, log: &Path, files: &[PathBuf]) -> Se
     Sequence {
         source: Source::Log { log: log.to_owned(), truth },
         clock,
+        one_camera: dataset == Dataset::EurocMono,
         settings: settings(dataset, &name),
         disturbed: disturbed(dataset, &name),
         name,
@@ -299,8 +300,14 @@ fn trials(root: &Path) -> Result<Vec<Sequence>, BenchError> {
 }
 
 fn sequence(name: String, source: Source) -> Sequence {
-    let clock = Clock::Shared;
-    Sequence { name, source, clock, settings: Vec::new(), disturbed: Vec::new() }
+    Sequence {
+        name,
+        source,
+        clock: Clock::Shared,
+        one_camera: false,
+        settings: Vec::new(),
+        disturbed: Vec::new(),
+    }
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use std::str::FromStr;
 use super::dataset::{Clock, Dataset, Sequence, Source};
 use super::discovery::{find, same_sequence};
 use super::error::BenchError;
-use super::recipe::RECIPES;
+use super::recipe::{RECIPES, Sensors};
 use crate::config::Config;
 use crate::evaluation::read_trajectory;
 use crate::odometry::InitMode;
@@ -297,6 +297,7 @@ fn simulated(root: Option<&PathBuf>, request: &BenchRequest) -> Result<Vec<Seque
             name: recipe.name.to_owned(),
             source: Source::Recipe { recipe: *recipe, trajectory: None },
             clock: Clock::Shared,
+            one_camera: recipe.sensors == Sensors::Mono,
             settings: recipe.settings(),
             disturbed: recipe.disturbed.to_vec(),
         };
@@ -322,6 +323,7 @@ fn simulated(root: Option<&PathBuf>, request: &BenchRequest) -> Result<Vec<Seque
             settings: recipe.settings(),
             source: Source::Recipe { recipe, trajectory: Some(file) },
             clock: Clock::Shared,
+            one_camera: false,
             disturbed: Vec::new(),
         })
     };

@@ -280,6 +280,12 @@ impl Part<'_> {
 
     fn outcome(&self, replayed: &Replayed, gathered: Gathered, faults: &[Fault]) -> Outcome {
         let metrics = &replayed.metrics;
+        let others =
+            ["right", "depth"].into_iter().find(|role| metrics.sources.contains_key(*role));
+        if let (true, Some(role)) = (self.run.sequence.one_camera, others) {
+            let failure = format!("the {role} images were used: no run with one camera alone");
+            return Outcome { failure: Some(failure), ..Outcome::default() };
+        }
         let mut outcome = Outcome {
             initialization: metrics.odometry.initialization.clone(),
             frames: metrics.odometry.frames_processed,

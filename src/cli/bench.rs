@@ -1,10 +1,9 @@
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use indicatif::ProgressBar;
 
-use super::terminal::{INTERRUPTED, catch_interrupts, progress, tell};
+use super::terminal::{INTERRUPTED, catch_interrupts, print, progress, tell};
 use mfg_vio::bench::{
     Axis, BenchError, BenchReport, BenchRequest, Dataset, Guard, Plan, Progress, Store, Workshop,
     execute, findings_table, plan, report, rows, sweep_figure,
@@ -123,7 +122,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<()> {
         true => serde_json::to_string(&results)? + "\n",
         false => results.to_text(),
     };
-    std::io::stdout().write_all(output.as_bytes())?;
+    print(&output)?;
     let found = Guard::of(&command_line(), &runs);
     if let Some(path) = &args.write_guard {
         found.write(path)?;
@@ -181,7 +180,7 @@ fn print_plan(plan: &Plan, json: bool) -> anyhow::Result<()> {
         }
         false => plan.runs.iter().map(|run| run.label()).collect::<Vec<_>>().join("\n"),
     };
-    Ok(writeln!(std::io::stdout(), "{output}")?)
+    print(&output)
 }
 
 fn save(out: &Path, results: &BenchReport) -> anyhow::Result<()> {

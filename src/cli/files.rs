@@ -9,18 +9,19 @@ use mfg_vio::output::{Files, resolved};
 use super::results::Results;
 
 /// Arguments that name what is written; all other paths are read.
-const OUTPUTS: [&str; 10] = [
-    "cache",
+const OUTPUTS: [&str; 9] = [
     "out",
     "output",
+    "rrd",
     "plot",
     "report",
-    "rrd",
     "save_map",
-    "write_calibration",
     "write_config",
+    "write_calibration",
     "write_guard",
 ];
+/// Arguments that name what is neither: a folder that the program keeps for itself.
+const OWN: [&str; 1] = ["cache"];
 /// Arguments that name logs. If they are folders, nothing is written into them.
 const LOGS: [&str; 3] = ["log", "input", "root"];
 
@@ -37,6 +38,9 @@ pub fn prepare(command: &Command, matches: &ArgMatches) -> anyhow::Result<()> {
     let mut earlier = Vec::new();
     for argument in command.get_arguments() {
         let id = argument.get_id().as_str();
+        if OWN.contains(&id) {
+            continue;
+        }
         for value in paths(matches, id) {
             let role = role(argument);
             if !OUTPUTS.contains(&id) {

@@ -39,7 +39,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
     let title = format!("Absolute pose error ({}), {alignment} alignment", relation.unit());
     let compare = |reference: &Trajectory, estimate: &Trajectory, association| {
         let align_n = inputs.matching.align_n.map(NonZeroUsize::get);
-        let options = ApeOptions { association, alignment, align_n, relation };
+        let mut options = ApeOptions { association, alignment, align_n, relation };
+        if inputs.matching.seeks_offset() && relation == Relation::Translation {
+            let start = options.association.time_offset;
+            options.association.time_offset =
+                evaluation::best_clock_offset(reference, estimate, start, &options)?;
+        }
+        let association = options.association;
         let pairs = evaluation::associate(reference, estimate, &association)?;
         let suspicions = evaluation::suspicions(reference, estimate, &pairs, &options);
         let scale_check = args.scale_check.then(|| evaluation::similarity_scale(&pairs));
@@ -53,6 +59,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let figure =
             || evaluation::trajectory_figure(&result.pairs, &result.errors, relation.unit());
         Ok(Compared {
+            time_offset: association.time_offset,
             figures: args.output.draws().then(figure).into_iter().collect(),
             stamps: result.pairs.stamps.clone(),
             pairs: result.pairs,

@@ -71,6 +71,8 @@ impl From<&SubTrajectoryError> for SubTrajectory {
 
 /// An estimate that was compared with the reference.
 pub(super) struct Compared {
+    /// Seconds added to the stamps of the estimate.
+    pub(super) time_offset: f64,
     /// The matched poses, the estimate's aligned.
     pub(super) pairs: PosePairs,
     pub(super) alignment: Similarity,
@@ -116,11 +118,11 @@ impl Inputs {
                 unit,
                 statistics: case.statistics,
                 alignment: case.alignment,
-                time_offset: association.time_offset,
+                time_offset: case.time_offset,
                 kind: case.kind.clone(),
                 warnings: case.warnings.clone(),
             });
-            compared.push((association.time_offset, case));
+            compared.push((case.time_offset, case));
         }
         if let Some(path) = &self.rrd {
             let estimates = names.iter().zip(&compared);

@@ -81,6 +81,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<()> {
         let draws = args.output.draws() && !lengths.is_empty();
         let stamps = result.links.iter().filter_map(|&(_, j)| result.pairs.stamps.get(j).copied());
         Ok(Compared {
+            time_offset: association.time_offset,
             figures: draws.then(figure).into_iter().collect(),
             stamps: stamps.collect(),
             pairs: result.pairs,
