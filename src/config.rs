@@ -52,8 +52,11 @@ const SHIPPED: [(&str, &str); 5] = [
     ("sim", include_str!("../configs/sim.toml")),
 ];
 
-/// The configuration of `gnss` where none is given.
-const GNSS: &str = include_str!("../configs/kitti.toml");
+/// The configurations of `gnss`, by the name that a log's layout asks for.
+const GNSS: [(&str, &str); 2] = [
+    ("gnss", include_str!("../configs/gnss.toml")),
+    ("kitti", include_str!("../configs/kitti.toml")),
+];
 
 /// The configuration of `attitude` where none is given.
 const ATTITUDE: &str = include_str!("../configs/attitude.toml");
@@ -160,9 +163,11 @@ fn shipped_text(name: &str) -> Result<&'static str, ConfigError> {
 }
 
 impl GnssConfig {
-    /// `configs/kitti.toml`, with `overrides` (`section.key=value`).
-    pub fn shipped(overrides: &[String]) -> Result<Self, ConfigError> {
-        parse(GNSS, "configs/kitti.toml", overrides)
+    /// The configuration that is shipped under `name`, with `overrides` (`section.key=value`).
+    pub fn shipped(name: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let shipped = GNSS.iter().find(|(shipped, _)| *shipped == name);
+        let (_, text) = shipped.ok_or_else(|| ConfigError::NotShipped { name: name.to_owned() })?;
+        parse(text, &format!("configs/{name}.toml"), overrides)
     }
 
     /// Reads `path` and applies `overrides` (`section.key=value`).
@@ -314,9 +319,11 @@ mod tests {
             let missing: Vec<_> = valid.iter().filter(|key| !given.contains(key)).collect();
             assert!(missing.is_empty(), "{name}: {missing:?}");
         }
-        GnssConfig::shipped(&[]).unwrap();
-        let given = flat_keys(&GNSS.parse().unwrap());
-        assert_eq!(given.len(), valid_keys::<GnssConfig>().unwrap().len(), "{given:?}");
+        for (name, text) in GNSS {
+            GnssConfig::shipped(name, &[]).unwrap();
+            let given = flat_keys(&text.parse().unwrap());
+            assert_eq!(given.len(), valid_keys::<GnssConfig>().unwrap().len(), "{given:?}");
+        }
     }
 
     #[test]

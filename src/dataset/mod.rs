@@ -59,6 +59,6 @@ pub use inspect::{
     TopicInspection, Verdict, inspect,
 };
 pub use navigation::{NavigationLog, NavigationTopics, read_navigation};
-pub use navigation_csv::{read_imu_table, read_position_table};
+pub use navigation_csv::{Positions, is_kitti_table, read_imu_table, read_position_table};
 pub use open::{detect, open, open_with_faults};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

@@ -6,8 +6,10 @@ mod evaluation;
 mod faults;
 mod metrics;
 mod navigation;
+mod navigation_input;
 mod outputs;
 mod report;
+mod units;
 
 use std::iter::Peekable;
 use std::path::{Path, PathBuf};
@@ -21,8 +23,12 @@ pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors, evaluat
 pub use faults::{FaultOutcome, Naming, Recovered, confusion, expected_name, fault_grid};
 pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
+pub use navigation_input::{
+    NavigationInput, NavigationInputError, NavigationLogs, NavigationSource,
+};
 pub use outputs::{RESULTS, state_columns};
 pub use report::{Series, figures, report};
+pub use units::UnitError;
 
 use crate::config::Config;
 use crate::dataset::{self, Fault, Log, ReadReport};
