@@ -5,10 +5,12 @@ mod support;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+use mfg_vio::sensor::Stamp;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
+use support::ros2::{Body, Message};
 use support::{fail, json, lines, recording, text};
 
 const GRAVITY: f64 = 9.81;
@@ -290,5 +292,174 @@ fn studies_of_navigation_report_every_filter_and_their_consistency() {
             let value = mean(filter, quantity);
             assert!(value > 1.0 && value < 6.0, "{filter} {quantity} {value}");
         }
+    }
+}
+
+/// The rows of a table without its header.
+fn rows(path: &Path) -> Vec<Vec<f64>> {
+    let row = |line: &String| line.split(',').map(|x| x.parse().unwrap()).collect();
+    lines(path)[1..].iter().map(row).collect()
+}
+
+/// Latitude and longitude (deg) of a place east and north of the origin by so little that the
+/// earth's radii of curvature there do.
+fn place(east: f64, north: f64) -> [f64; 2] {
+    let (latitude, longitude) = (48.0_f64, 11.0);
+    let e2 = 0.006_694_379_990_14;
+    let w = 1.0 - e2 * latitude.to_radians().sin().powi(2);
+    let meridian = 6_378_137.0 * (1.0 - e2) / w.powf(1.5);
+    let normal = 6_378_137.0 / w.sqrt();
+    [
+        latitude + (north / meridian).to_degrees(),
+        longitude + (east / (normal * latitude.to_radians().cos())).to_degrees(),
+    ]
+}
+
+fn nmea(t: f64, [latitude, longitude]: [f64; 2], height: f64) -> String {
+    let angle = |degrees: f64, width: usize| {
+        let minutes = degrees.fract() * 60.0;
+        format!("{:0width$}{minutes:011.8}", degrees.trunc())
+    };
+    let (hours, minutes) = ((t / 3600.0).floor(), (t / 60.0).floor() % 60.0);
+    let body = format!(
+        "GPGGA,{hours:02}{minutes:02}{:06.3},{},N,{},E,4,12,0.6,{height:.3},M,0.0,M,,",
+        t % 60.0,
+        angle(latitude, 2),
+        angle(longitude, 3),
+    );
+    let sum = body.bytes().fold(0, |sum, byte| sum ^ byte);
+    format!("${body}*{sum:02X}\n")
+}
+
+/// Local positions, z up and z down, places by angles, and NMEA sentences: the same drive.
+#[test]
+fn a_drive_in_other_coordinates_is_the_same_drive() {
+    let drive = drive(60);
+    let fixes = rows(&drive.gps);
+    let mut tables = [
+        String::from("t,north,east,down\n"),
+        String::from("t,latitude,longitude,height\n"),
+        String::new(),
+    ];
+    for fix in &fixes {
+        let [t, x, y, z] = fix[..] else { panic!("{fix:?}") };
+        let [latitude, longitude] = place(x, y);
+        writeln!(tables[0], "{t},{y},{x},{}", -z).unwrap();
+        writeln!(tables[1], "{t},{latitude:.11},{longitude:.11},{}", z + 500.0).unwrap();
+        tables[2].push_str(&nmea(t, [latitude, longitude], z + 500.0));
+    }
+    let more = [&SETTINGS[..], &["--json"]].concat();
+    let local = json(&arguments(&drive.imu, &drive.gps, "mfgi", &more));
+    assert!(local["datum"].is_null());
+    let mean = |report: &serde_json::Value| report["nis"]["mean"].as_f64().unwrap();
+    for (table, earth) in tables.iter().zip([false, true, true]) {
+        let gps = drive.gps.with_file_name("other.txt");
+        std::fs::write(&gps, table).unwrap();
+        let report = json(&arguments(&drive.imu, &gps, "mfgi", &more));
+        assert_eq!(report["datum"].is_array(), earth);
+        assert!((mean(&report) - mean(&local)).abs() < 0.05, "{} {}", mean(&report), mean(&local));
+        assert_eq!(report["fixes_used"], local["fixes_used"]);
+    }
+}
+
+/// One MCAP file with `Imu` and `NavSatFix` in place of two tables; the fixes' covariance counts.
+#[test]
+fn a_log_with_both_streams_is_navigated() {
+    let drive = drive(60);
+    let mut messages = Vec::new();
+    for row in rows(&drive.imu) {
+        let stamp = Stamp::from_seconds(row[0]).unwrap();
+        let vector = |at: usize| Vector3::new(row[at], row[at + 1], row[at + 2]);
+        messages.push(support::ros2::imu("/imu/data", stamp, (vector(1), 1e-6), (vector(4), 1e-2)));
+    }
+    for row in rows(&drive.gps) {
+        let [latitude, longitude] = place(row[1], row[2]);
+        messages.push(nav_sat_fix(row[0], [latitude, longitude, row[3] + 500.0], FIX_SD));
+    }
+    messages.sort_by_key(|message| message.time);
+    let log = support::ros2::write_mcap(&drive.imu.with_file_name("drive.mcap"), &messages);
+    let settings = &SETTINGS[..6];
+    let more = ["--topic", "imu=/imu/data", "--topic", "gnss=/fix", "--json"];
+    let report = json(&[&["gnss", text(&log)], settings, &more].concat());
+    assert!(report["datum"].is_array());
+    assert_eq!(report["fixes_used"], 60);
+    assert!(report["assumed"]["receiver.horizontal_noise"].is_null(), "{report}");
+    let mean = report["nis"]["mean"].as_f64().unwrap();
+    assert!(mean > 2.0 && mean < 4.0, "{mean}");
+    assert!(report["heading_converged_s"].is_number(), "{report}");
+    let missing = fail(&["gnss", text(&log), "--topic", "gnss=/gps"]);
+    assert!(missing.contains("drive.mcap") && missing.contains("/fix"), "{missing}");
+}
+
+fn nav_sat_fix(t: f64, place: [f64; 3], sd: f64) -> Message {
+    let stamp = Stamp::from_seconds(t).unwrap();
+    let variance = sd * sd;
+    let body = Body::new(stamp, "gps")
+        .number([0])
+        .number(1_u16.to_le_bytes())
+        .numbers(place)
+        .numbers([variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance])
+        .number([2]);
+    Message::new("/fix", "NavSatFix", stamp, body)
+}
+
+/// A noise that is wrong by a factor of four, either way: nothing is said of the heading.
+#[test]
+fn a_heading_is_not_told_where_the_innovations_contradict_it() {
+    let drive = drive(90);
+    for (noise, too) in [("0.125", "small"), ("2", "large")] {
+        let noise = [
+            format!("receiver.horizontal_noise={noise}"),
+            format!("receiver.vertical_noise={noise}"),
+        ];
+        let mut more = SETTINGS.to_vec();
+        more.extend(["--set", &noise[0], "--set", &noise[1], "--json"]);
+        let report = json(&arguments(&drive.imu, &drive.gps, "mfgi", &more));
+        assert!(report["heading_converged_s"].is_null(), "{report}");
+        assert_eq!(report["heading"]["consistent"], false);
+        let advice = report["heading"]["advice"].as_str().unwrap();
+        assert!(advice.contains(too) && advice.contains("noise"), "{advice}");
+    }
+}
+
+#[test]
+fn what_is_assumed_is_said() {
+    let drive = drive(20);
+    let report = json(&arguments(&drive.imu, &drive.gps, "mfgi", &["--json"]));
+    assert_eq!(report["assumed"]["receiver.horizontal_noise"], 2.0);
+    let set = ["--set", "receiver.horizontal_noise=0.5", "--json"];
+    let report = json(&arguments(&drive.imu, &drive.gps, "mfgi", &set));
+    assert!(report["assumed"]["receiver.horizontal_noise"].is_null(), "{report}");
+    let said = support::succeed(&arguments(&drive.imu, &drive.gps, "mfgi", &[]));
+    assert!(said.contains("assumed") && said.contains("receiver.vertical_noise"), "{said}");
+}
+
+#[test]
+fn wrong_units_and_outages_are_refused_with_the_setting() {
+    let drive = drive(60);
+    let beyond = ["--outage", "50,20"];
+    let message = fail(&arguments(&drive.imu, &drive.gps, "mfgi", &beyond));
+    assert!(message.contains("outage") && message.contains("59.0 s"), "{message}");
+    let table = lines(&drive.imu);
+    let scaled = |factors: [f64; 7]| {
+        let mut text = format!("{}\n", table[0]);
+        for row in rows(&drive.imu) {
+            let row: Vec<String> =
+                row.iter().zip(factors).map(|(x, factor)| (x * factor).to_string()).collect();
+            writeln!(text, "{}", row.join(",")).unwrap();
+        }
+        let path = drive.imu.with_file_name("scaled.csv");
+        std::fs::write(&path, text).unwrap();
+        path
+    };
+    let degrees = 1.0_f64.to_degrees();
+    for (factors, setting) in [
+        ([1.0, 1.0, 1.0, 1.0, 1.0 / 9.80665, 1.0 / 9.80665, 1.0 / 9.80665], "accelerometer_scale"),
+        ([1.0, degrees, degrees, degrees, 1.0, 1.0, 1.0], "gyroscope_scale"),
+        ([1e3, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0], "1e-3 s"),
+    ] {
+        let message = fail(&arguments(&scaled(factors), &drive.gps, "mfgi", &SETTINGS));
+        assert!(message.contains(setting), "{message}");
+        assert_eq!(message.trim_end().lines().count(), 1, "{message}");
     }
 }

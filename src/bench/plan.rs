@@ -195,7 +195,7 @@ fn check_settings(request: &BenchRequest) -> Result<(), BenchError> {
         let settings: Vec<String> = request.settings.iter().cloned().chain(swept).collect();
         match request.dataset {
             Dataset::KittiImuGps => {
-                crate::filter::gnss::GnssConfig::shipped(&settings)?;
+                crate::filter::gnss::GnssConfig::shipped("kitti", &settings)?;
             }
             Dataset::Broad => {
                 if let Some(setting) = settings.first() {

@@ -9,11 +9,12 @@ use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use super::error::BenchError;
 use super::figures::NeesMeans;
 use super::record::Outcome;
-use crate::dataset::{read_imu_table, read_position_table};
 use crate::evaluation::NeesSummary;
 use crate::filter::attitude::AttitudeFilterKind;
 use crate::filter::gnss::{GnssConfig, GnssFilterKind, OutageConfig, navigate};
-use crate::replay::{AttitudeRequest, replay_attitude};
+use crate::replay::{
+    AttitudeRequest, NavigationInput, NavigationLogs, NavigationSource, replay_attitude,
+};
 
 /// Attitude RMSE of a trial of BROAD over its movement phase, after taking out the mean heading
 /// error: filters differ in what they call north. The files of the run go to `work`.
@@ -129,8 +130,11 @@ pub(super) fn navigation(
         path: imu.to_owned(),
         reason: format!("no filter {filter}"),
     })?;
-    let config = GnssConfig { outage: OUTAGE, ..GnssConfig::shipped(settings)? };
-    let (samples, fixes) = (read_imu_table(imu)?, read_position_table(gps)?);
+    let config = GnssConfig { outage: OUTAGE, ..GnssConfig::shipped("kitti", settings)? };
+    let source = NavigationSource::Tables { imu: imu.to_owned(), gnss: gps.to_owned() };
+    let input = NavigationLogs::read(source, &config).and_then(|logs| logs.prepare(&config));
+    let NavigationInput { imu: samples, fixes, .. } = input
+        .map_err(|error| BenchError::Format { path: imu.to_owned(), reason: error.to_string() })?;
     let summary =
         navigate(kind, &config, &samples, &fixes, |_| match stop.load(Ordering::Relaxed) {
             true => ControlFlow::Break(()),

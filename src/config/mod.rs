@@ -66,8 +66,11 @@ const SHIPPED: [(&str, &str); 6] = [
 /// The configuration of sensors that are not known: without the calibration of a camera.
 const GENERIC: &str = "generic";
 
-/// The configuration of `gnss` where none is given.
-const GNSS: &str = include_str!("../../configs/kitti.toml");
+/// The configurations of `gnss`, by the name that a log's layout asks for.
+const GNSS: [(&str, &str); 2] = [
+    ("gnss", include_str!("../../configs/gnss.toml")),
+    ("kitti", include_str!("../../configs/kitti.toml")),
+];
 
 /// The configuration of `attitude` where none is given.
 const ATTITUDE: &str = include_str!("../../configs/attitude.toml");
@@ -162,9 +165,11 @@ fn shipped_text(name: &str) -> Result<&'static str, ConfigError> {
 }
 
 impl GnssConfig {
-    /// `configs/kitti.toml`, with `overrides` (`section.key=value`).
-    pub fn shipped(overrides: &[String]) -> Result<Self, ConfigError> {
-        parse(GNSS, "configs/kitti.toml", overrides)
+    /// The configuration that is shipped under `name`, with `overrides` (`section.key=value`).
+    pub fn shipped(name: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let shipped = GNSS.iter().find(|(shipped, _)| *shipped == name);
+        let (_, text) = shipped.ok_or_else(|| ConfigError::NotShipped { name: name.to_owned() })?;
+        parse(text, &format!("configs/{name}.toml"), overrides)
     }
 
     /// Reads `path` and applies `overrides` (`section.key=value`).
@@ -343,9 +348,11 @@ mod tests {
             let open: BTreeSet<&str> = open.iter().copied().collect();
             assert_eq!(missing.collect::<BTreeSet<_>>(), open, "{name}");
         }
-        GnssConfig::shipped(&[]).unwrap();
-        let given = flat_keys(&GNSS.parse().unwrap());
-        assert_eq!(given.len(), valid_keys::<GnssConfig>().unwrap().len(), "{given:?}");
+        for (name, text) in GNSS {
+            GnssConfig::shipped(name, &[]).unwrap();
+            let given = flat_keys(&text.parse().unwrap());
+            assert_eq!(given.len(), valid_keys::<GnssConfig>().unwrap().len(), "{given:?}");
+        }
     }
 
     #[test]

@@ -65,6 +65,6 @@ pub use inspect::{
 };
 pub use layout::Layout;
 pub use navigation::{NavigationLog, NavigationTopics, read_navigation};
-pub use navigation_csv::{read_imu_table, read_position_table};
+pub use navigation_csv::{Positions, is_kitti_table, read_imu_table, read_position_table};
 pub use open::{detect, detect_with, open, open_with_faults};
 pub use write::{LogWriter, LogWriterOptions, Quirks, WriteError, WriteSummary};

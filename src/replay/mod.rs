@@ -6,10 +6,12 @@ mod evaluation;
 mod faults;
 mod metrics;
 mod navigation;
+mod navigation_input;
 mod outputs;
 mod report;
 #[cfg(feature = "vision")]
 mod trial;
+mod units;
 
 use std::iter::Peekable;
 use std::path::{Path, PathBuf};
@@ -23,10 +25,14 @@ pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors, evaluat
 pub use faults::{FaultOutcome, Naming, Recovered, confusion, expected_name, fault_grid};
 pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
+pub use navigation_input::{
+    NavigationInput, NavigationInputError, NavigationLogs, NavigationSource,
+};
 pub use outputs::{RESULTS, state_columns};
 pub use report::{Series, figures, report};
 #[cfg(feature = "vision")]
 pub use trial::{Tried, try_out};
+pub use units::UnitError;
 
 use crate::config::Config;
 use crate::dataset::{self, Fault, Log, LogSummary, ReadReport};

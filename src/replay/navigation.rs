@@ -21,6 +21,8 @@ impl NavigationOutputs {
         let mut columns = belief_columns();
         let fix = ["heading_sd", "fix", "nis", "residual_x", "residual_y", "residual_z"];
         columns.extend(fix.map(str::to_owned));
+        // Mean of the last normalised innovations squared, and whether the belief agrees with it.
+        columns.extend(["nis_window", "consistent"].map(str::to_owned));
         state.line(&columns.join(","))?;
         Ok(Self { trajectory, state })
     }
@@ -44,6 +46,13 @@ impl NavigationOutputs {
                 fields.extend(fix.innovation.residual.iter().map(|r| format!("{r:.9e}")));
             }
             None => fields.extend(vec![String::new(); 5]),
+        }
+        match &step.consistency {
+            Some(consistency) => {
+                fields.push(format!("{:.9e}", consistency.mean));
+                fields.push(u8::from(consistency.holds()).to_string());
+            }
+            None => fields.extend(vec![String::new(); 2]),
         }
         self.state.line(&fields.join(","))
     }

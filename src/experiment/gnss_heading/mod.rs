@@ -49,6 +49,8 @@ pub const STUDIES: &[Study] = &[
 const GUIDED: f64 = 60.0;
 /// Without, s, and when the position is compared with the truth.
 const OUTAGE: f64 = 60.0;
+/// All of it; a last fix after the last mark ends the outage.
+const DURATION: f64 = GUIDED + OUTAGE + 1.0;
 const OUTAGE_MARKS: [(f64, &str); 3] =
     [(10.0, "outage_10s_m"), (20.0, "outage_20s_m"), (60.0, "outage_60s_m")];
 const RATES: [f64; 3] = [1.0, 5.0, 10.0];
@@ -103,7 +105,7 @@ fn config(cell: &Cell) -> GnssConfig {
     config.receiver.vertical_noise = cell.noise;
     // Accelerations of 1.7 m/s^2 while it is levelled.
     config.start.tilt_sd = 10.0;
-    config.outage = OutageConfig { start: GUIDED, length: OUTAGE, period: 0.0 };
+    config.outage = OutageConfig { start: GUIDED, length: DURATION - GUIDED, period: 0.0 };
     config.output.interval = f64::MAX;
     config
 }
@@ -121,7 +123,7 @@ fn study(request: &Request, name: &str, cells: &'static [Cell]) -> Result<Report
 fn trial(cells: &'static [Cell], rng: &mut ChaCha8Rng) -> Result<Trial, NavigationError> {
     let mut trial = Trial::default();
     for vehicle in Vehicle::ALL {
-        let drive = Drive::new(vehicle, &imu(), GUIDED + OUTAGE, rng);
+        let drive = Drive::new(vehicle, &imu(), DURATION, rng);
         let seed = rng.random();
         for cell in cells.iter().filter(|cell| cell.vehicle == vehicle) {
             for filter in FILTERS {
@@ -276,7 +278,7 @@ mod tests {
     fn mfgi_finds_the_heading_of_every_vehicle() {
         let mut rng = ChaCha8Rng::seed_from_u64(12);
         for cell in QUICK_CELLS.iter() {
-            let drive = Drive::new(cell.vehicle, &imu(), GUIDED + OUTAGE, &mut rng);
+            let drive = Drive::new(cell.vehicle, &imu(), DURATION, &mut rng);
             let mut trial = Trial::default();
             run(cell, "mfgi", &drive, 0, &mut trial).unwrap();
             let value = |quantity: &str| {

@@ -11,6 +11,7 @@ use crate::sensor::PositionFix;
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct GnssConfig {
+    pub log: NavigationLogConfig,
     pub imu: ImuConfig,
     pub receiver: ReceiverConfig,
     pub start: StartConfig,
@@ -18,6 +19,53 @@ pub struct GnssConfig {
     pub consistency: ConsistencyConfig,
     pub outage: OutageConfig,
     pub output: OutputConfig,
+}
+
+/// Where samples and fixes are in a log, and in which axes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NavigationLogConfig {
+    /// Topic of the IMU in a bag or MCAP file; empty: chosen by message type.
+    pub imu_topic: String,
+    /// Topic of the fixes likewise.
+    pub gnss_topic: String,
+    pub imu_axes: ImuAxes,
+    pub world_axes: WorldAxes,
+}
+
+impl Default for NavigationLogConfig {
+    fn default() -> Self {
+        Self {
+            imu_topic: String::new(),
+            gnss_topic: String::new(),
+            imu_axes: ImuAxes::Auto,
+            world_axes: WorldAxes::Auto,
+        }
+    }
+}
+
+/// Axes of the IMU; outputs are in forward, left, up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ImuAxes {
+    /// Forward, right, down if the specific force points along -z, else as they are.
+    Auto,
+    /// Forward, left, up, or any others that are to stay.
+    Flu,
+    /// Forward, right, down.
+    Frd,
+}
+
+/// Axes of positions in a local frame; outputs are in east, north, up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum WorldAxes {
+    /// By the names of the columns; z up where they tell nothing.
+    Auto,
+    /// East, north, up.
+    Enu,
+    /// North, east, down.
+    Ned,
 }
 
 /// The GNSS receiver and how its fixes are trusted.

@@ -52,8 +52,8 @@ use crate::inertial::{Belief, NavCovariance, NavState, block, symmetrize};
 use crate::so3::{exp, log, right_jacobian_inverse};
 
 /// Windows on the circle and the standard deviation of one, rad: so wide that their sum is even.
-const WINDOWS: usize = 24;
-const WINDOW_SD: f64 = 10.0 * DEGREE;
+const WINDOWS: usize = 36;
+const WINDOW_SD: f64 = 20.0 / 3.0 * DEGREE;
 /// A component is divided beyond this standard deviation of its heading: twice that of a window.
 const DIVIDED_SD: f64 = 2.0 * WINDOW_SD;
 /// Components are not merged to one that is broader, unless there are too many of them.

@@ -32,7 +32,8 @@ use crate::inertial::{Belief, ImuConfig, NavState, block};
 
 pub use belief::Regression;
 pub use config::{
-    GnssConfig, GnssFilterConfig, OutageConfig, OutputConfig, ReceiverConfig, StartConfig,
+    GnssConfig, GnssFilterConfig, ImuAxes, NavigationLogConfig, OutageConfig, OutputConfig,
+    ReceiverConfig, StartConfig, WorldAxes,
 };
 pub use consistency::{Consistency, ConsistencyConfig};
 pub use mekf::MekfGnss;

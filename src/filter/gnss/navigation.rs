@@ -5,7 +5,9 @@ use std::ops::ControlFlow;
 use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 
 use super::consistency::ConsistencyMonitor;
-use super::{Consistency, GnssConfig, GnssFilter, GnssFilterKind, InitialBelief, Innovation};
+use super::{
+    Consistency, GnssConfig, GnssFilter, GnssFilterKind, InitialBelief, Innovation, OutageConfig,
+};
 use crate::filter::{FilterError, InertialStep};
 use crate::inertial::{Belief, Coverage, ImuConfig, InitialAttitude, NavState, block};
 use crate::sensor::{ImuSample, PositionFix, Stamp};
@@ -26,6 +28,12 @@ pub enum NavigationError {
     NoStart { max_gap: f64, imu: usize, fixes: usize, imu_range: [Stamp; 2], fix_range: [Stamp; 2] },
     #[error("there are no IMU samples or no fixes")]
     Empty,
+    /// An artificial outage that no fix ends.
+    #[error(
+        "`outage` from {start} s for {length} s reaches beyond the last fix, {last:.1} s after the \
+         first"
+    )]
+    Outage { start: f64, length: f64, last: f64 },
     #[error("the specific force after the first fix at {0} has no direction: free fall?")]
     Level(Stamp),
     #[error("at {stamp}: {source}")]
@@ -184,6 +192,7 @@ pub fn navigate_with(
     check_order("fixes", fixes.iter().map(|fix| fix.stamp))?;
     let coverage = Coverage::before_each(imu, config.imu.max_gap);
     let Start { origin, samples, coverage, fixes } = find_start(config, imu, &coverage, fixes)?;
+    check_outage(config, fixes)?;
     let (mut run, first) = Run::start(start, config, &origin, samples, &fixes[0])?;
     let mut waiting = fixes[1..].iter().peekable();
     let mut now = origin;
@@ -222,6 +231,18 @@ fn check_order(
             return Err(NavigationError::Order { what, earlier, later });
         }
         earlier = later;
+    }
+    Ok(())
+}
+
+fn check_outage(config: &GnssConfig, fixes: &[PositionFix]) -> Result<(), NavigationError> {
+    let OutageConfig { start, length, .. } = config.outage;
+    let last = match fixes {
+        [first, .., last] => last.stamp.seconds_since(first.stamp),
+        _ => 0.0,
+    };
+    if length > 0.0 && start + length > last {
+        return Err(NavigationError::Outage { start, length, last });
     }
     Ok(())
 }
