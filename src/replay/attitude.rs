@@ -9,11 +9,13 @@ use serde::Serialize;
 use super::ReplayError;
 use super::outputs::OutputFile;
 use crate::config::Config;
-use crate::dataset::{self, ImuCsv, ImuRow, Log, LogConfig, LogError, LogSummary};
+use crate::dataset::{
+    self, ImuCsv, ImuRow, LogError, LogSummary, NavigationTopics, read_navigation,
+};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::filter::attitude::{AdaptiveAttitude, AdaptiveConfig, AttitudeFilterKind, AttitudeStep};
 use crate::filter::{Estimate, FilterError};
-use crate::sensor::{Event, Stamp};
+use crate::sensor::{ImuSample, MagneticSample, Stamp};
 
 /// What is asked for.
 pub struct AttitudeRequest<'a> {
@@ -229,7 +231,7 @@ fn finish(output: Option<OutputFile>) -> Result<(), ReplayError> {
 
 type Rows = Box<dyn Iterator<Item = Result<ImuRow, LogError>>>;
 
-/// The samples of a log of images and IMU, or else of a CSV file, in SI units, and the settings.
+/// The samples of a log with an IMU, or else of a CSV file, in SI units, and the settings.
 fn open(request: &AttitudeRequest) -> Result<(Rows, AdaptiveConfig), ReplayError> {
     let path = &request.log;
     let summary = match dataset::detect(path) {
@@ -244,21 +246,35 @@ fn open(request: &AttitudeRequest) -> Result<(Rows, AdaptiveConfig), ReplayError
             .map(move |row| row.map(|row| ImuRow { imu: imu.in_si_units(&row.imu), ..row }));
         return Ok((Box::new(rows), config));
     };
-    if !summary.has_imu {
+    let topics = NavigationTopics {
+        imu: request.topic.clone().unwrap_or_default(),
+        gnss: "none".to_owned(),
+        magnetic: String::new(),
+    };
+    let log = read_navigation(path, &topics, &config.imu)?;
+    if log.imu.is_empty() {
         let available = summary.sources.values().cloned().collect::<Vec<_>>().join(", ");
         let role = "IMU";
         return Err(LogError::MissingStream { path: path.to_owned(), role, available }.into());
     }
-    let none = || "none".to_owned();
-    let imu_only = LogConfig {
-        color_topic: none(),
-        depth_topic: none(),
-        truth_topic: none(),
-        imu_topic: request.topic.clone().unwrap_or_default(),
-        ..LogConfig::default()
+    for (role, source) in &log.sources {
+        tracing::info!("{role}: {source}");
+    }
+    let rows = with_magnetic_field(&log.imu, &log.magnetic);
+    Ok((Box::new(rows.into_iter().map(Ok)), config))
+}
+
+/// Gives every sample the last reading of the magnetometer since the sample before.
+fn with_magnetic_field(imu: &[ImuSample], magnetic: &[MagneticSample]) -> Vec<ImuRow> {
+    let mut readings = magnetic.iter().peekable();
+    let row = |sample: &ImuSample| {
+        let mut magnetic_field = None;
+        while let Some(reading) = readings.next_if(|reading| reading.stamp <= sample.stamp) {
+            magnetic_field = Some(reading.field);
+        }
+        ImuRow { imu: *sample, magnetic_field }
     };
-    let log = dataset::open(path, &imu_only, &config.imu)?;
-    Ok((Box::new(ImuOfLog(log)), config))
+    imu.iter().map(row).collect()
 }
 
 /// That of the file, or the shipped one in the units of the log's layout.
@@ -279,18 +295,4 @@ fn configuration(
     }
     overrides.extend(request.overrides.iter().cloned());
     Ok(AdaptiveConfig::shipped(&overrides)?)
-}
-
-struct ImuOfLog(Box<dyn Log>);
-
-impl Iterator for ImuOfLog {
-    type Item = Result<ImuRow, LogError>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        loop {
-            if let Event::Imu(imu) = self.0.next_event()? {
-                return Some(Ok(ImuRow { imu, magnetic_field: None }));
-            }
-        }
-    }
 }

@@ -52,8 +52,8 @@ impl Default for MagneticConfig {
             noise: 0.03,
             noise_correlation_time: 3.0,
             field_walk: 1e-3,
-            iron_sd: 0.02,
-            iron_walk: 7e-3,
+            iron_sd: 0.04,
+            iron_walk: 1.2e-2,
             iron_turn: 0.5,
             new_iron_sd: 2.0,
             delay_sd: 0.01,
@@ -62,7 +62,7 @@ impl Default for MagneticConfig {
             calm_time: 1.0,
             patience: 20.0,
             heading_sd: 3f64.to_radians(),
-            heading_correlation_time: 8.0,
+            heading_correlation_time: 4.0,
             disturbed_factor: 10.0,
         }
     }
