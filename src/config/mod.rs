@@ -8,8 +8,6 @@ mod resolve;
 
 pub mod import;
 
-pub mod import;
-
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
