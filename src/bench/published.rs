@@ -424,8 +424,9 @@ mod tests {
         for (row, printed) in EUROC_STEREO.iter().zip(printed) {
             assert!((mean(row) - printed).abs() < 7e-4, "{} {}", row.estimator, mean(row));
         }
+        // Of three digits, some of them cut off rather than rounded.
         for (row, printed) in EUROC_MONO.iter().zip([0.069, 0.125, 0.150, 0.202]) {
-            assert!((mean(row) - printed).abs() < 7e-4, "{} {}", row.estimator, mean(row));
+            assert!((mean(row) - printed).abs() < 1e-3, "{} {}", row.estimator, mean(row));
         }
     }
 

@@ -376,7 +376,7 @@ fn run(
     for (number, frame) in drive.frames.iter().enumerate() {
         let offset = landmarks.calibration().map_or(0.0, |estimate| estimate.time_offset);
         let time = frame.stamp.offset_by(offset);
-        if !landmarks.propagate_to(time) && number > 0 {
+        if !landmarks.propagate_to(time) {
             continue;
         }
         landmarks.see(|back_end| {

@@ -56,14 +56,13 @@ impl LandmarkRun {
         self.points.extend(id.map(|id| (landmark, id)));
     }
 
-    /// Carries the belief to `time`; false if it is there already.
+    /// Carries the belief to `time`; false if it is past that.
     pub fn propagate_to(&mut self, time: Stamp) -> bool {
-        let ahead = time > self.cursor.time;
-        if ahead {
+        if time > self.cursor.time {
             let window = self.cursor.window_until(time, &mut self.imu);
             self.back_end.propagate(&window);
         }
-        ahead
+        time == self.cursor.time
     }
 
     /// Takes a frame, `measure` being what it shows by the calibration that the back end has.
