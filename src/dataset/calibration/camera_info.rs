@@ -42,6 +42,8 @@ pub(in crate::dataset) enum Model {
     RadialTangential,
     Rational,
     Equidistant,
+    DoubleSphere,
+    Omnidirectional,
 }
 
 impl Model {
@@ -51,6 +53,8 @@ impl Model {
             Self::RadialTangential => "radial-tangential",
             Self::Rational => "rational",
             Self::Equidistant => "equidistant",
+            Self::DoubleSphere => "double-sphere",
+            Self::Omnidirectional => "omnidirectional",
         }
     }
 }
@@ -122,6 +126,14 @@ impl CameraInfo {
         }
         let used = d.iter().rposition(|x| *x != 0.0).map_or(0, |last| last + 1);
         let model = match self.model.as_str() {
+            // These are no pinholes without coefficients either.
+            "equidistant" | "fisheye" | "kannala_brandt" | "kannala_brandt4" | "KB4"
+                if used <= 4 =>
+            {
+                Model::Equidistant
+            }
+            "double-sphere" if used <= 2 => Model::DoubleSphere,
+            "omnidirectional" if used <= 5 => Model::Omnidirectional,
             _ if used == 0 => Model::RadialTangential,
             "plumb_bob" | "rational_polynomial" | "radtan" | "radial-tangential" | ""
                 if used <= 5 =>
@@ -129,18 +141,14 @@ impl CameraInfo {
                 Model::RadialTangential
             }
             "plumb_bob" | "rational_polynomial" if used <= 8 => Model::Rational,
-            "equidistant" | "fisheye" | "kannala_brandt" | "kannala_brandt4" | "KB4"
-                if used <= 4 =>
-            {
-                Model::Equidistant
-            }
             name => return Err(format!("has a distortion `{name}` of {used} coefficients")),
         };
         let wanted = match model {
-            _ if used == 0 => 0,
-            Model::RadialTangential => 5,
+            Model::RadialTangential if used == 0 => 0,
+            Model::RadialTangential | Model::Omnidirectional => 5,
             Model::Rational => 8,
             Model::Equidistant => 4,
+            Model::DoubleSphere => 2,
         };
         Ok((model, (0..wanted).map(|k| d.get(k).copied().unwrap_or(0.0)).collect()))
     }
@@ -264,6 +272,8 @@ mod tests {
         let eight = [0.1, 0.2, 0.0, 0.0, 0.3, 0.1, 0.2, 0.3];
         assert_eq!(of("rational_polynomial", &eight), Ok((Model::Rational, 8)));
         assert_eq!(of("equidistant", &[0.1, 0.0, 0.0, 0.0]), Ok((Model::Equidistant, 4)));
+        assert_eq!(of("equidistant", &[0.0; 4]), Ok((Model::Equidistant, 4)));
+        assert_eq!(of("double-sphere", &[-0.2, 0.6]), Ok((Model::DoubleSphere, 2)));
         assert_eq!(of("plumb_bob", &[0.1, 0.0, 0.0, 0.0]), Ok((Model::RadialTangential, 5)));
         assert!(of("thin_prism", &[0.1]).unwrap_err().contains("thin_prism"));
         let zero = CameraInfo { intrinsic: [0.0; 4], ..info() };
