@@ -18,13 +18,15 @@ const TIME_UNITS: [f64; 3] = [1e-3, 1e-6, 1e-9];
 /// Largest range of gyroscopes on the market (4000 deg/s), rad/s.
 const LARGEST_RATE: f64 = 70.0;
 /// A turn of the course is told from noise if the way between fixes is so many standard deviations.
-const NOISE_FACTOR: f64 = 10.0;
+const NOISE_FACTOR: f64 = 20.0;
 /// Shortest way (m) and longest time (s) between two fixes of a course.
 const SHORTEST_WAY: f64 = 1.0;
 const LONGEST_TIME: f64 = 5.0;
-/// Turns that decide, and the correlation beyond which they do.
+/// Turns that decide, and the correlation beyond which they do: standard deviations of that of as
+/// many independent pairs, and the least.
 const FEWEST_TURNS: usize = 20;
-const DECISIVE: f64 = 0.8;
+const DECISIVE_DEVIATIONS: f64 = 4.0;
+const LEAST_DECISIVE: f64 = 0.5;
 
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum UnitError {
@@ -130,10 +132,11 @@ pub fn check_course(
     let correlation = xy / (xx * yy).sqrt();
     let ratio = xy / xx;
     let degrees = 1.0_f64.to_radians();
-    if correlation < -DECISIVE {
+    let decisive = LEAST_DECISIVE.max(DECISIVE_DEVIATIONS / n.sqrt());
+    if correlation < -decisive {
         return Err(UnitError::Mirrored { inverted: -config.imu.accelerometer_scale });
     }
-    if correlation > DECISIVE && (0.5 * degrees..2.0 * degrees).contains(&ratio) {
+    if correlation > decisive && (0.5 * degrees..2.0 * degrees).contains(&ratio) {
         return Err(UnitError::Turns { ratio, factor: config.imu.gyroscope_scale * degrees });
     }
     Ok(())
