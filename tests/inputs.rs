@@ -12,8 +12,8 @@ use mfg_vio::inertial::ImuConfig;
 use mfg_vio::sensor::{Event, ImuSample, PixelFormat, RgbdFrame};
 use nalgebra::Vector3;
 use support::ros2::{
-    Message, compressed, depth_bytes, image, imu, mcap_bytes, plain_color, plain_depth, plain_imu,
-    recording, write_db3, write_mcap,
+    Message, camera_info, compressed, depth_bytes, image, imu, mcap_bytes, plain_color,
+    plain_depth, plain_imu, recording, write_db3, write_mcap,
 };
 use support::{fail, json, mfg_vio, text};
 
@@ -418,6 +418,52 @@ fn encodings_that_are_not_read_are_named_with_those_that_are() {
     let video = |frame: &RgbdFrame| compressed("/c", frame.stamp, "h264", &stream);
     let error = refused(&video, &plain_depth);
     assert!(error.contains("encoding h264 of /c is not supported"), "{error}");
+}
+
+/// Depth of half as many pixels along a side as color.
+fn half_depth(frame: &RgbdFrame) -> Message {
+    let (width, height) = (frame.depth.width() / 2, frame.depth.height() / 2);
+    let pixels = (0..width * height).map(|i| (i % width * 2, i / width * 2));
+    let values = pixels.map(|(column, row)| frame.depth.data()[row * frame.depth.width() + column]);
+    let data: Vec<u8> = values.flat_map(u16::to_le_bytes).collect();
+    image("/depth/image_rect_raw", frame.stamp, "16UC1", (width, height), &data)
+}
+
+#[test]
+fn depth_of_another_size_is_registered_or_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let original = &recording().frames[0];
+    let size = (original.color.width(), original.color.height());
+    let color =
+        |frame: &RgbdFrame| Message { topic: "/color/image_raw".to_owned(), ..plain_color(frame) };
+    let messages = recording().messages(color, half_depth, plain_imu);
+    let bare: Vec<Message> =
+        messages.into_iter().filter(|m| !m.schema.contains("CameraInfo")).collect();
+    let path = write_mcap(&folder.path().join("bare.mcap"), &bare);
+    let opened = open(&path, &LogConfig::default(), &ImuConfig::default());
+    let error = opened.err().unwrap().to_string();
+    let expected = format!(
+        "depth images of /depth/image_rect_raw ({}x{}) are not registered to color images of \
+         /color/image_raw",
+        size.0 / 2,
+        size.1 / 2
+    );
+    assert!(error.contains(&expected), "{error}");
+    let [fx, fy, cx, cy] = [460.0, 461.0, 330.0, 250.0];
+    let half = [fx / 2.0, fy / 2.0, (cx + 0.5) / 2.0 - 0.5, (cy + 0.5) / 2.0 - 0.5];
+    let stamp = original.stamp;
+    let calibrated = [
+        camera_info("/color/camera_info", stamp, size, [fx, fy, cx, cy]),
+        camera_info("/depth/camera_info", stamp, (size.0 / 2, size.1 / 2), half),
+        color(original),
+        half_depth(original),
+    ];
+    let read = events(&write_mcap(&folder.path().join("calibrated.mcap"), &calibrated));
+    let [Event::Frame(frame)] = &read[..] else { panic!("{read:?}") };
+    for (index, depth) in frame.depth.data().iter().enumerate() {
+        let (column, row) = (index % size.0 / 2 * 2, index / size.0 / 2 * 2);
+        assert_eq!(*depth, original.depth.data()[row * size.0 + column], "pixel {index}");
+    }
 }
 
 /// All files and folders of messages below a folder.

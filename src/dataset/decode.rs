@@ -152,6 +152,9 @@ impl RosSource {
             tracing::warn!("imu: {topic} has no accelerometer, and no other topic has: not used");
         }
         let summary = survey.summary_of(kind, &chosen, rig.as_ref());
+        if rig.is_none() && summary.calibration.registration.is_none() {
+            survey.check_sizes(path, &chosen)?;
+        }
         let decoder = survey.decoder(&chosen, log, imu);
         Ok((Self::of_topics(messages, chosen, decoder), summary, rig))
     }

@@ -108,7 +108,8 @@ fn rig(root: &Path, config: &LogConfig) -> Result<StereoRig, LogError> {
         (_, [left, right]) => (left.clone(), right.clone(), first_image_size(root)?),
         _ => {
             return Err(failed(format!(
-                "no sensor.yaml in {LEFT} and {RIGHT}; set their calibrations in `log.stereo`"
+                "no sensor.yaml in {LEFT} and {RIGHT}; set their calibrations in `log.stereo`, which \
+                 `mfg-vio config import` makes of a Kalibr file"
             )));
         }
     };

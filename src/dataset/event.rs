@@ -189,6 +189,18 @@ pub enum LogError {
     MissingStream { path: PathBuf, role: &'static str, available: String },
     #[error("{path}: encoding {encoding} of {topic} is not supported; supported are {supported}")]
     Encoding { path: PathBuf, topic: String, encoding: String, supported: &'static str },
+    #[error(
+        "{path}: depth images of {depth} ({}x{}) are not registered to color images of {color} \
+         ({}x{}); record depth aligned to color, or the CameraInfo of both and the transform between \
+         their frames", .depth_size.0, .depth_size.1, .color_size.0, .color_size.1
+    )]
+    Unregistered {
+        path: PathBuf,
+        color: String,
+        color_size: (u32, u32),
+        depth: String,
+        depth_size: (u32, u32),
+    },
     #[error("{path}: no depth, and none from its two cameras: {reason}")]
     Stereo { path: PathBuf, reason: String },
     #[error("log.{key} = {value}: expected {expected}")]

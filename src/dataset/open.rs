@@ -155,9 +155,10 @@ impl MessageFile {
 ///
 /// # Errors
 /// [`LogError::UnknownFormat`] if it is none of these, [`LogError::MissingStream`] if color,
-/// depth or a configured topic is not there, [`LogError::Stereo`] if there are two cameras that
-/// give no depth, [`LogError::Config`] if a key of `log` has no meaning, [`LogError::Io`] if it
-/// cannot be read.
+/// depth or a configured topic is not there, [`LogError::Encoding`] if their encoding is not read,
+/// [`LogError::Unregistered`] if depth is of other pixels than color, [`LogError::Stereo`] if there
+/// are two cameras that give no depth, [`LogError::Config`] if a key of `log` has no meaning,
+/// [`LogError::Io`] if it cannot be read.
 pub fn open(path: &Path, log: &LogConfig, imu: &ImuConfig) -> Result<Box<dyn Log>, LogError> {
     open_with_faults(path, log, imu, &[])
 }

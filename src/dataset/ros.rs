@@ -736,6 +736,25 @@ impl Survey {
         }
     }
 
+    /// The error that depth images have other pixels than color images.
+    pub fn check_sizes(
+        &self,
+        path: &Path,
+        chosen: &BTreeMap<Role, String>,
+    ) -> Result<(), LogError> {
+        let stream = |role: Role| {
+            let topic = chosen.get(&role)?;
+            Some((topic.clone(), self.topics.get(topic)?.size()?))
+        };
+        match stream(Role::Color).zip(stream(Role::Depth)) {
+            Some(((color, color_size), (depth, depth_size))) if color_size != depth_size => {
+                let path = path.to_path_buf();
+                Err(LogError::Unregistered { path, color, color_size, depth, depth_size })
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// An image topic that would have been taken for `role`, were its encoding read.
     fn unreadable(&self, role: Role) -> Option<&String> {
         let is_depth = |name: &str, image: &ImageHead| {

@@ -16,6 +16,9 @@ pub struct DepthRegistration {
     pub color_size: (usize, usize),
 }
 
+/// A pixel of the depth image covers at most so many pixels of the color image along a side.
+const LARGEST_BOX: f64 = 64.0;
+
 impl DepthRegistration {
     /// The depth image registered pixel for pixel to the color image; `None` if the size or
     /// the calibration of the color image is none.
@@ -41,6 +44,10 @@ impl DepthRegistration {
             else {
                 continue;
             };
+            // Boxes of points that all but touch the color camera would cover all of its image.
+            if (first - second).amax() > LARGEST_BOX {
+                continue;
+            }
             let depths = corners.map(|point| lens.depth_of(&point.coords));
             let units = ((depths[0] + depths[1]) / 2.0 / scale).round();
             if !(units >= 1.0 && units <= f64::from(u16::MAX)) {

@@ -91,6 +91,26 @@ pub fn compressed(topic: &str, stamp: Stamp, format: &str, data: &[u8]) -> Messa
     Message::new(topic, "CompressedImage", stamp, body)
 }
 
+/// `sensor_msgs/CameraInfo` of a pinhole camera (fx, fy, cx, cy) without distortion.
+pub fn camera_info(
+    topic: &str,
+    stamp: Stamp,
+    (width, height): (usize, usize),
+    [fx, fy, cx, cy]: [f64; 4],
+) -> Message {
+    let body = Body::new(stamp, "camera")
+        .number((height as u32).to_le_bytes())
+        .number((width as u32).to_le_bytes())
+        .text("plumb_bob")
+        .number(0_u32.to_le_bytes())
+        .numbers([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+        .numbers([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+        .numbers([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]);
+    // Binning and region of interest.
+    let body = (0..6).fold(body, |body, _| body.number(0_u32.to_le_bytes())).number([0]);
+    Message::new(topic, "CameraInfo", stamp, body)
+}
+
 /// `sensor_msgs/Imu`; the first number of each half's covariance marks what is not measured.
 pub fn imu(
     topic: &str,
