@@ -90,7 +90,7 @@ fn show(args: &ShowArgs) -> anyhow::Result<()> {
     if args.json {
         let object = json!({
             "log": args.log.display().to_string(),
-            "config": resolved.name(),
+            "config": resolved.file_name(),
             "device": resolved.summary.calibration.device,
             "settings": settings,
             "conflicts": resolved.conflicts,

@@ -73,7 +73,7 @@ pub fn run(args: &Args) -> anyhow::Result<()> {
         return print(&serde_json::to_string_pretty(&inspection)?);
     }
     let mut text = String::new();
-    describe(&mut text, &inspection, &resolved.name())?;
+    describe(&mut text, &inspection, &resolved.file_name())?;
     if let Some(file) = &args.write_config {
         writeln!(text, "configuration: {}", file.display())?;
     }

@@ -176,8 +176,13 @@ impl Resolved {
         self.origins.get(key).unwrap_or(&Origin::Default)
     }
 
-    /// What to call the configuration: the given file, or the shipped one.
+    /// What to call the configuration: the given file, or the shipped one by its short name.
     pub fn name(&self) -> String {
+        self.file.as_ref().map_or_else(|| self.shipped.clone(), |file| file.display().to_string())
+    }
+
+    /// The given file, or the shipped one.
+    pub fn file_name(&self) -> String {
         match &self.file {
             Some(file) => file.display().to_string(),
             None => format!("configs/{}.toml", self.shipped),

@@ -563,7 +563,12 @@ impl Survey {
             && is("/imu", Role::Imu);
         // The same topics may come from a log that was converted to SI units.
         let in_g = self.topics.get("/imu").is_some_and(Topic::logs_g);
-        if layout && in_g { "vcu_rvi" } else { "generic" }
+        match () {
+            () if layout && in_g => "vcu_rvi",
+            // This program's notes are in logs that it simulated.
+            () if self.camera.is_some() => "sim",
+            () => "generic",
+        }
     }
 
     /// Chooses a topic for each role; `Err` names the first that is configured but not there.
