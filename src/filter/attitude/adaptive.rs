@@ -14,6 +14,7 @@ use crate::inertial::{
     ImuConfig, MagneticConfig, Prediction, RestConfig,
 };
 use crate::sensor::ImuSample;
+use crate::so3::exp;
 
 /// Settings of [`AdaptiveAttitude`]. Of the IMU's, those of the gyroscope and gravity are used.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -432,17 +433,20 @@ fn guide_covariance(up: &BodyDirection, north: Option<&BodyDirection>) -> Matrix
     (Matrix3::identity() - vertical) * up.variance + vertical * heading
 }
 
-/// The attitude nearest to `attitude` that has `up` in body coordinates.
+/// The attitude nearest to `attitude` that has `up`, a unit vector, in body coordinates.
 fn with_up(attitude: &Rotation3<f64>, up: &Vector3<f64>) -> Rotation3<f64> {
     let before = attitude.inverse() * Vector3::z();
-    // Opposite directions: any half turn about a horizontal axis.
-    let turn = Rotation3::rotation_between(&before, up).unwrap_or_else(|| {
-        Rotation3::from_axis_angle(
-            &nalgebra::Unit::new_normalize(attitude.inverse() * Vector3::x()),
-            std::f64::consts::PI,
-        )
-    });
-    attitude * turn.inverse()
+    let (cross, cosine) = (before.cross(up), before.dot(up));
+    let sine = cross.norm();
+    let turn = if sine > f64::EPSILON {
+        cross * (sine.atan2(cosine) / sine)
+    } else if cosine > 0.0 {
+        Vector3::zeros()
+    } else {
+        // Opposite directions: a half turn about a horizontal axis.
+        attitude.inverse() * Vector3::x() * std::f64::consts::PI
+    };
+    attitude * exp(&-turn)
 }
 
 fn with_up_of(attitude: &Rotation3<f64>, other: &Rotation3<f64>) -> Rotation3<f64> {
@@ -464,7 +468,7 @@ mod tests {
 
     use super::*;
     use crate::sensor::Stamp;
-    use crate::so3::{exp, log};
+    use crate::so3::log;
 
     const WITH_BIAS: [AttitudeFilterKind; 7] = [
         AttitudeFilterKind::Mekf,
@@ -539,6 +543,20 @@ mod tests {
             stamp: Stamp::from_seconds(seconds).unwrap(),
             angular_velocity: Vector3::zeros(),
             specific_force: Vector3::new(0.0, 0.0, 9.81),
+        }
+    }
+
+    #[test]
+    fn an_attitude_is_levelled_by_the_smallest_turn() {
+        let attitude = exp(&Vector3::new(0.4, -1.0, 0.7));
+        let own = attitude.inverse() * Vector3::z();
+        for turn in [0.0, 1e-17, 1e-9, 0.3, 3.0, std::f64::consts::PI] {
+            let axis = own.cross(&Vector3::x()).normalize();
+            let up = exp(&(axis * turn)) * own;
+            let level = with_up(&attitude, &up);
+            assert!((level.inverse() * Vector3::z() - up).norm() < 1e-9, "{turn}");
+            let turned = log(&(attitude.inverse() * level)).norm();
+            assert!((turned - turn).abs() < 1e-7, "{turn}");
         }
     }
 
