@@ -331,7 +331,9 @@ mod tests {
             let stored = guard(&mut rng, 1.0);
             let is_worse = |found: &Guard| stored.compare(found).iter().any(|f| f.worse);
             refused += u32::from(is_worse(&guard(&mut rng, 1.0)));
-            caught += u32::from(is_worse(&guard(&mut rng, 1.6)));
+            // The limit of all 18 runs together: Student's t with 12 degrees of freedom at a level of
+            // 0.01/21 on either side, 4.9 times 0.3 sqrt(2/18), is a factor of 1.63.
+            caught += u32::from(is_worse(&guard(&mut rng, 2.0)));
         }
         // One in a hundred is expected; six in 300 of a binomial are at the 97 % quantile.
         assert!(refused <= 6, "{refused}");
