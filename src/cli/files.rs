@@ -141,7 +141,8 @@ mod tests {
         assert!(found.len() > 25, "{}", found.len());
         for (path, argument) in found {
             let id = argument.get_id().as_str();
-            let known = OUTPUTS.contains(&id) || LOGS.contains(&id) || INPUTS.contains(&id);
+            let lists: [&[&str]; 4] = [&OUTPUTS, &OWN, &LOGS, &INPUTS];
+            let known = lists.iter().any(|list| list.contains(&id));
             assert!(known, "`{path}`: say of the path `{id}` whether it is read or written");
             if OUTPUTS.contains(&id) && is_directory(&argument) {
                 assert!(Results::is_known(&path), "say what `{path}` writes into a directory");

@@ -249,7 +249,8 @@ fn typed<T: DeserializeOwned>(table: toml::Table, origin: &str) -> Result<T, Con
         ConfigError::BadValue {
             origin: origin.to_owned(),
             key: error.path().to_string(),
-            message: error.inner().to_string().trim().to_owned(),
+            // In one line: without another one that names the key again.
+            message: error.inner().message().trim().to_owned(),
         }
     })
 }

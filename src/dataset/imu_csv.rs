@@ -85,7 +85,7 @@ impl ImuCsv {
 
 impl Names {
     fn of(line: &str) -> Result<Self, String> {
-        let names: Vec<&str> = header_fields(line).collect();
+        let names = header_names(line);
         let positions = by_name(&names)?;
         let stamp = positions.first().and_then(|k| names.get(*k));
         Ok(Self { unit: stamp.and_then(|name| TimeUnit::of_name(name)), positions })
@@ -152,20 +152,21 @@ fn column(name: &str) -> Option<usize> {
     Some(1 + 3 * group + axis)
 }
 
-fn header_fields(line: &str) -> impl Iterator<Item = &str> {
+fn header_names(line: &str) -> Vec<String> {
     let line = line.trim_start_matches(['#', ' ']);
-    Dialect::of(line).fields(line)
+    Dialect::of(line).names(line)
 }
 
 /// Whether a line names columns, perhaps behind a `#`.
 fn names_columns(line: &str) -> bool {
-    let known = header_fields(line).filter(|name| column(name).is_some()).count();
+    let names = header_names(line);
+    let known = names.iter().filter(|name| column(name).is_some()).count();
     let is_number = |field: &str| Dialect::of(line).number(field).is_some();
-    let is_text = header_fields(line).next().is_some_and(|first| !is_number(first));
+    let is_text = names.first().is_some_and(|first| !is_number(first));
     known >= INERTIAL_COLUMNS || is_text && !line.starts_with('#')
 }
 
-fn by_name(names: &[&str]) -> Result<Vec<usize>, String> {
+fn by_name(names: &[String]) -> Result<Vec<usize>, String> {
     let found: Vec<Option<usize>> = names.iter().map(|name| column(name)).collect();
     let position = |k: usize| found.iter().position(|column| *column == Some(k));
     let positions: Vec<usize> = (0..COLUMNS.len()).map_while(position).collect();
@@ -184,8 +185,7 @@ fn by_name(names: &[&str]) -> Result<Vec<usize>, String> {
 
 /// Positions of stamp, angular velocity and specific force, if `line` names all of them.
 pub(super) fn imu_columns(line: &str) -> Option<[usize; INERTIAL_COLUMNS]> {
-    let names: Vec<&str> = header_fields(line).collect();
-    by_name(&names).ok()?.get(..INERTIAL_COLUMNS)?.try_into().ok()
+    by_name(&header_names(line)).ok()?.get(..INERTIAL_COLUMNS)?.try_into().ok()
 }
 
 fn in_order(fields: &[&str]) -> Result<Vec<usize>, String> {
@@ -252,6 +252,10 @@ mod tests {
             format!("t;gx;gy;gz;ax;ay;az\n{semicolons}"),
             format!("\u{feff}t,gx,gy,gz,ax,ay,az\r\n{}", numbers.replace('\n', "\r\n")),
             nanoseconds.clone(),
+            format!(
+                "t [ns] gx [rad/s] gy [rad/s] gz [rad/s] ax [m s^-2] ay [m s^-2] az [m s^-2]\n{}",
+                nanoseconds.replace(',', " ")
+            ),
             format!("%time,w.x,w.y,w.z,field.linear_acceleration.x,acc_y,aZ\n{nanoseconds}"),
             format!(
                 "#timestamp [ns],a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2],\

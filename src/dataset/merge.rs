@@ -453,7 +453,7 @@ fn registered(
 mod tests {
     use nalgebra::{Isometry3, Vector3};
 
-    use super::super::samples::read_all;
+    use super::super::samples::{read_all, read_runs};
     use super::*;
     use crate::sensor::PixelFormat;
 
@@ -487,12 +487,23 @@ mod tests {
         Reading::Depth(at(millis), DepthImage::new(width, 1, 0.001, vec![1; width]).unwrap())
     }
 
-    /// Kind and milliseconds of the events, and the counts of what was left out.
-    fn merge(readings: Vec<Reading>, window: f64) -> (Vec<(char, i64)>, BTreeMap<String, u64>) {
+    /// Kinds and milliseconds of the events, and the counts of what was left out.
+    type Merged = (Vec<(char, i64)>, BTreeMap<String, u64>);
+
+    /// Of one run, whose events are in order.
+    fn merge(readings: Vec<Reading>, window: f64) -> Merged {
+        merge_by(read_all, readings, window)
+    }
+
+    fn merge_by(
+        read: fn(&mut dyn Log) -> Vec<Event>,
+        readings: Vec<Reading>,
+        window: f64,
+    ) -> Merged {
         let config = LogConfig { reorder_window: window, ..LogConfig::default() };
         let source = Readings(readings.into_iter());
         let mut log = MergedLog::new(source, LogSummary::default(), &config);
-        let events = read_all(&mut log).into_iter().map(|event| {
+        let events = read(&mut log).into_iter().map(|event| {
             let kind = match event {
                 Event::Imu(_) => 'i',
                 Event::Frame(_) => 'f',
@@ -558,7 +569,7 @@ mod tests {
                     readings.extend([color(clock(millis), 2), depth(clock(millis), 2)]);
                 }
             }
-            let (events, skipped) = merge(readings, 0.5);
+            let (events, skipped) = merge_by(read_runs, readings, 0.5);
             assert_eq!((events.len(), skipped.len()), (440, 0), "{jump}");
             let jumps: Vec<_> = events
                 .windows(2)

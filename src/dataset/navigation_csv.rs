@@ -174,10 +174,10 @@ impl NamedTable {
         })?;
         let header = header.trim_start_matches(['#', ' ']);
         let plain =
-            |name: &str| name.split(['[', '(']).next().unwrap_or_default().trim().to_lowercase();
-        let names = Dialect::of(header).fields(header);
-        let units = names.clone().map(TimeUnit::of_name).collect();
-        Ok(Self { lines, names: names.map(plain).collect(), units })
+            |name: &String| name.split(['[', '(']).next().unwrap_or_default().trim().to_lowercase();
+        let names = Dialect::of(header).names(header);
+        let units = names.iter().map(|name| TimeUnit::of_name(name)).collect();
+        Ok(Self { lines, names: names.iter().map(plain).collect(), units })
     }
 
     fn position(&self, name: &str) -> Option<usize> {

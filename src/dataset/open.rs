@@ -301,7 +301,7 @@ mod tests {
     use std::ops::ControlFlow;
     use std::path::PathBuf;
 
-    use super::super::samples::{self, Sample, read_all};
+    use super::super::samples::{self, Sample, read_all, read_runs};
     use super::super::{Assumed, Event, RgbdFrame, convert, inspect};
     use super::*;
     use crate::sensor::CameraConfig;
@@ -471,7 +471,8 @@ mod tests {
                 }
                 let path = samples::file(&folder, "log", &damaged);
                 if let Ok(mut log) = open_default(&path) {
-                    assert!(read_all(log.as_mut()).len() <= samples.len());
+                    // A damaged stamp can make all that follow it those of a new run.
+                    assert!(read_runs(log.as_mut()).len() <= samples.len());
                 }
                 let (log, imu) = (LogConfig::default(), ImuConfig::default());
                 let assumed = Assumed::new(&log, &imu);

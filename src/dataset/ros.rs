@@ -561,10 +561,13 @@ impl Survey {
         let layout = is("/cam0/color", Role::Color)
             && is("/cam0/depth", Role::Depth)
             && is("/imu", Role::Imu);
-        // The same topics may come from a log that was converted to SI units.
+        // The same topics may come from a log that was converted to SI units, or from another
+        // recorder, whose accelerometer in g need not be inverted as theirs is.
         let in_g = self.topics.get("/imu").is_some_and(Topic::logs_g);
+        let image = self.topics.get("/cam0/color").and_then(|topic| topic.image.as_ref());
+        let is_theirs = image.is_none_or(|image| image.encoding == "8UC3");
         match () {
-            () if layout && in_g => "vcu_rvi",
+            () if layout && in_g && is_theirs => "vcu_rvi",
             // This program's notes are in logs that it simulated.
             () if self.camera.is_some() => "sim",
             () => "generic",

@@ -273,8 +273,9 @@ mod tests {
             stamps
         };
         let expected = frames(&written(&str::to_owned));
+        // One second apart as before: no one confirms a step of more than ten.
         let stamps =
-            |text: &str| text.replace("0.5 ", "0500000000000 ").replace("1.5 ", "1500000000000 ");
+            |text: &str| text.replace("0.5 ", "0500000000000 ").replace("1.5 ", "0501000000000 ");
         let spellings: [&dyn Fn(&str) -> String; 6] = [
             &|text| format!("\u{feff}{}", text.replace('\n', "\r\n")),
             &|text| format!("\u{feff}# list\r\n{text}"),
@@ -289,6 +290,7 @@ mod tests {
         // 10 500 s after the device began.
         let late = frames(&written(&stamps));
         assert_eq!(late[0].nanos(), 10_500_000_000_000);
+        assert_eq!(late.last().unwrap().nanos(), 10_501_000_000_000);
     }
 
     #[test]

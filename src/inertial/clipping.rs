@@ -15,6 +15,9 @@ const LEAST_RANGE: f64 = 0.8;
 const EXCESS_SHARE: f64 = 0.15;
 /// Readings before and after a flat top that give its slopes.
 const MARGIN: usize = 2;
+/// Readings that are kept within the range: when the end of a range is found, the first ones of the
+/// flat top are among them.
+const KEPT: usize = MARGIN + FLAT_TOP - 1;
 /// Readings of one clipped turn that are kept at most, at 200 Hz five seconds.
 const LONGEST: usize = 1000;
 
@@ -78,8 +81,15 @@ impl ClippingMonitor {
         let mut variance = Vector3::zeros();
         for (axis, ends) in self.ends.iter_mut().enumerate() {
             for (end, sign) in ends.iter_mut().zip([1.0, -1.0]) {
+                let was_limit = end.is_limit;
                 if let Some(added) = end.observe(sign * rate[axis], seconds) {
                     axes[axis] = true;
+                    if !was_limit {
+                        // The readings of the flat top by which it was found are clipped, too.
+                        for reading in self.readings.iter_mut().rev().take(FLAT_TOP - 1) {
+                            reading.clipped[axis] = true;
+                        }
+                    }
                     variance[axis] += added;
                 }
             }
@@ -93,9 +103,11 @@ impl ClippingMonitor {
         if self.calm.is_some_and(|calm| calm >= MARGIN) {
             missed = missed_turn(&self.readings);
             self.calm = None;
+            // What has been made good is not made good again.
+            self.readings.drain(..self.readings.len().saturating_sub(MARGIN));
         }
         if self.calm.is_none() || self.readings.len() > LONGEST {
-            self.readings.drain(..self.readings.len().saturating_sub(MARGIN));
+            self.readings.drain(..self.readings.len().saturating_sub(KEPT));
         }
         Clipped { axes, missed, variance }
     }
@@ -197,10 +209,12 @@ mod tests {
         Vector3::new(5.0 * (6.0 * t).sin(), 4.0 * (5.0 * t + 1.0).sin(), (9.0 * t).cos()) + noise
     }
 
+    /// After 4.8 s, when all axes are within their ranges again: what a flat top hides is made good
+    /// only at its end.
     fn angle_lost(limit: f64, make_good: bool) -> f64 {
         let mut monitor = ClippingMonitor::default();
         let (mut turned, mut read) = (Rotation3::identity(), Rotation3::identity());
-        for k in 1..500 {
+        for k in 1..=480 {
             let rate = rate(f64::from(k) * H);
             let clipped = rate.map(|x| x.clamp(-limit, limit));
             let found = monitor.observe(&clipped, H);

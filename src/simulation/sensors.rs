@@ -344,20 +344,21 @@ mod tests {
     /// within half a pixel, at the same depth, within two sigma.
     #[test]
     fn truth_carries_pixels_from_frame_to_frame() {
-        carries(&small_scene());
+        carries(&small_scene(), 800);
     }
 
-    /// The same with a view of 180 degrees, whose depth is the range.
+    /// The same with a view of 180 degrees, whose depth is the range. More of it leaves the image
+    /// between two frames, or is further away than depth reaches.
     #[test]
     fn truth_carries_pixels_of_a_fisheye() {
         let mut scene = small_scene();
         scene.camera.model = CameraModel::Equidistant;
         scene.camera.distortion = vec![0.0035, 0.0007, -0.002, 0.0002];
         (scene.camera.fx, scene.camera.fy) = (51.0, 51.0);
-        carries(&scene);
+        carries(&scene, 600);
     }
 
-    fn carries(scene: &SceneConfig) {
+    fn carries(scene: &SceneConfig, least_depths: u32) {
         let simulation = Simulation::new(scene.clone()).unwrap();
         let frames = frames(scene);
         let (first, later) = (&frames[20], &frames[23]);
@@ -395,7 +396,7 @@ mod tests {
                 .collect();
             shifts.extend(patch.and_then(|patch| residual_shift(&later.color, &patch)));
         }
-        assert!(depths > 800, "{depths}");
+        assert!(depths > least_depths, "{depths}");
         // What is hidden in one of the frames may disagree.
         assert!(f64::from(deep) > 0.97 * f64::from(depths), "{deep} of {depths}");
         let mut lengths: Vec<f64> = shifts.iter().map(Vector2::norm).collect();

@@ -46,13 +46,13 @@ pub(in crate::dataset) fn frame(name: &str) -> String {
 /// Frames and the fixed transforms between them.
 #[derive(Debug, Clone, Default)]
 pub(in crate::dataset) struct TransformTree {
-    /// By child: a frame has one parent.
-    edges: BTreeMap<String, Edge>,
+    /// By child and parent. A frame has one parent, but whoever sends the poses of a body may give
+    /// it another one beside the mount that it is fixed to.
+    edges: BTreeMap<(String, String), Edge>,
 }
 
 #[derive(Debug, Clone)]
 struct Edge {
-    parent: String,
     parent_from_child: Isometry3<f64>,
     moves: bool,
 }
@@ -61,22 +61,20 @@ impl TransformTree {
     /// Notes a transform; one that was seen to be different before is no mounting.
     pub fn add(&mut self, transform: Transform) {
         let Transform { parent, child, parent_from_child } = transform;
-        if let Some(edge) = self.edges.get_mut(&child) {
-            let change = edge.parent_from_child.inv_mul(&parent_from_child);
-            let size = change.translation.vector.norm().max(change.rotation.angle());
-            edge.moves |= edge.parent != parent || size > STILL;
-            return;
-        }
-        self.edges.insert(child, Edge { parent, parent_from_child, moves: false });
+        let first = Edge { parent_from_child, moves: false };
+        let edge = self.edges.entry((child, parent)).or_insert(first);
+        let change = edge.parent_from_child.inv_mul(&parent_from_child);
+        let size = change.translation.vector.norm().max(change.rotation.angle());
+        edge.moves |= size > STILL;
     }
 
     /// Whether a frame is named anywhere.
     pub fn knows(&self, name: &str) -> bool {
-        self.edges.contains_key(name) || self.edges.values().any(|edge| edge.parent == name)
+        self.edges.keys().any(|(child, parent)| child == name || parent == name)
     }
 
     pub fn frames(&self) -> BTreeSet<&str> {
-        self.edges.iter().flat_map(|(child, edge)| [child.as_str(), edge.parent.as_str()]).collect()
+        self.edges.keys().flat_map(|(child, parent)| [child.as_str(), parent.as_str()]).collect()
     }
 
     /// The transform that takes coordinates of `source` to those of `target`, through what does
@@ -104,11 +102,11 @@ impl TransformTree {
     fn neighbours<'a>(&'a self, name: &'a str) -> Vec<(&'a str, Isometry3<f64>)> {
         let fixed = || self.edges.iter().filter(|(_, edge)| !edge.moves);
         let up = fixed()
-            .filter(|(child, _)| *child == name)
-            .map(|(_, edge)| (edge.parent.as_str(), edge.parent_from_child));
+            .filter(|((child, _), _)| child == name)
+            .map(|((_, parent), edge)| (parent.as_str(), edge.parent_from_child));
         let down = fixed()
-            .filter(|(_, edge)| edge.parent == name)
-            .map(|(child, edge)| (child.as_str(), edge.parent_from_child.inverse()));
+            .filter(|((_, parent), _)| parent == name)
+            .map(|((child, _), edge)| (child.as_str(), edge.parent_from_child.inverse()));
         up.chain(down).collect()
     }
 }
@@ -153,5 +151,18 @@ mod tests {
         assert!(tree.between("imu", "camera").is_some());
         tree.add(edge("world", "imu", 0.5, 0.0));
         assert!(tree.between("imu", "camera").is_none());
+    }
+
+    /// The simulator's logs have it: poses of the IMU in the world beside the tree of the device.
+    #[test]
+    fn poses_of_a_body_do_not_take_it_off_its_mount() {
+        let mut tree = TransformTree::default();
+        tree.add(edge("link", "imu", 0.3, 0.0));
+        tree.add(edge("link", "camera", 0.1, 0.0));
+        tree.add(edge("world", "imu", 0.0, 0.0));
+        tree.add(edge("world", "imu", 0.5, 0.0));
+        let found = tree.between("imu", "camera").unwrap();
+        assert!((found.translation.vector.x + 0.2).abs() < 1e-12, "{found}");
+        assert!(tree.between("world", "camera").is_none());
     }
 }

@@ -142,7 +142,8 @@ fn unit(imu: &ImuInspection) -> String {
 
 /// Four digits are more than such a scale is known to.
 fn rounded(value: f64) -> f64 {
-    let digits = 3 - value.abs().log10().floor() as i32;
-    let unit = 10_f64.powi(digits.clamp(0, 12));
+    // Nothing and infinity, which damaged readings lead to, have infinite logarithms.
+    let digits = 3.0 - value.abs().log10().floor();
+    let unit = 10_f64.powi(digits.clamp(0.0, 12.0) as i32);
     (value * unit).round() / unit
 }

@@ -598,6 +598,10 @@ mod tests {
         };
         for kind in AttitudeFilterKind::ALL {
             for (seconds, range) in [(0.5, 2.0..15.0), (3.0, 8.0..60.0), (1e4, 40.0..140.0)] {
+                // Seven points of equal weight with this spread stand for no distribution with a
+                // mean shorter than about 0.91: beyond, `uae` reports the uniform one, 76 deg.
+                let is_uniform = kind == AttitudeFilterKind::Uae && seconds > 1.0;
+                let range = if is_uniform { 75.0..77.0 } else { range };
                 let [before, after, later] = after_a_gap(kind, seconds);
                 assert!(sd(&before) < 1.0, "{kind}: {}", sd(&before));
                 assert!(range.contains(&sd(&after)), "{kind}, {seconds} s: {}", sd(&after));

