@@ -122,7 +122,8 @@ impl StoredRow {
     fn of(runs: &[(PlannedRun, RunRecord)]) -> Option<Self> {
         let (first, _) = runs.first()?;
         let outcomes: Vec<&Outcome> = runs.iter().map(|(_, record)| &record.outcome).collect();
-        let named: [(&str, fn(&Outcome) -> Option<f64>); 6] = [
+        type Named = (&'static str, fn(&Outcome) -> Option<f64>);
+        let named: [Named; 6] = [
             ("ape_m", |o| o.ape_m),
             ("attitude_deg", |o| o.attitude_deg),
             ("rpe_1s_m", |o| o.rpe_1s_m),
@@ -220,9 +221,8 @@ fn differences(name: &str, pairs: &[(&StoredRow, &StoredRow)], level: f64) -> Ve
             told(row, mean(before), mean(after), inverse(before, after))
         })
         .collect();
-    let means = |side: fn(&(&StoredRow, Vec<f64>, Vec<f64>)) -> f64| {
-        mean(&logarithms.iter().map(side).collect::<Vec<_>>())
-    };
+    type Compared<'a> = (&'a StoredRow, Vec<f64>, Vec<f64>);
+    let means = |side: fn(&Compared) -> f64| mean(&logarithms.iter().map(side).collect::<Vec<_>>());
     let count = logarithms.len() as f64;
     let variance = logarithms.iter().map(|(_, b, a)| inverse(b, a)).sum::<f64>() / (count * count);
     let all = StoredRow { sequence: "all".to_owned(), ..StoredRow::default() };
@@ -365,7 +365,8 @@ mod tests {
     #[test]
     fn losses_are_told() {
         let stored = guard(&mut ChaCha8Rng::seed_from_u64(1), 1.0);
-        let changes: [(fn(&mut Guard), &str); 5] = [
+        type Change = (fn(&mut Guard), &'static str);
+        let changes: [Change; 5] = [
             (|g| g.rows[0].coverage = vec![0.9; 3], "coverage"),
             (|g| g.rows[0].failures = 1, "failures"),
             (|g| g.rows[0].faults_missed = vec!["black:4:1".to_owned()], "faults missed"),

@@ -250,7 +250,7 @@ mod tests {
     #[test]
     fn exact_positions_tell_the_velocity() {
         let truth = trajectory(&every(1.0 / 120.0, 0.0, 5.0), &Isometry3::identity());
-        for t in [0.5, 1.003, 2.7182, 4.9] {
+        for t in [0.5, 1.003, 2.703, 4.9] {
             let error = (velocity_at(&truth, t).unwrap() - velocity(t)).norm();
             assert!(error < 1e-7, "{error}");
         }

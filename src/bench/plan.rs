@@ -389,7 +389,8 @@ mod tests {
 
     #[test]
     fn what_does_not_exist_is_refused_before_anything_runs() {
-        let cases: [(fn(&mut BenchRequest), &str); 4] = [
+        type Case = (fn(&mut BenchRequest), &'static str);
+        let cases: [Case; 4] = [
             (|r| r.sequences = vec!["lab-simpel".to_owned()], "lab-simpel"),
             (|r| r.filters = vec!["mfgx".to_owned()], "mfgx"),
             (|r| r.settings = vec!["imu.gyro_nois=1".to_owned()], "imu.gyro_noise"),

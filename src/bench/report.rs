@@ -210,7 +210,8 @@ pub fn report(bench: &BenchReport, command: &str) -> Report {
 /// several settings each combination of the others has a curve of its own.
 pub fn sweep_figure(bench: &BenchReport) -> Option<Figure> {
     let keys = bench.swept();
-    let quantities: [(&str, &str, fn(&Row) -> Option<f64>); 4] = [
+    type Quantity = (&'static str, &'static str, fn(&Row) -> Option<f64>);
+    let quantities: [Quantity; 4] = [
         ("Position RMSE", "m", |row| row.ape_m.map(|spread| spread.median)),
         ("Attitude RMSE", "deg", |row| row.attitude_deg.map(|spread| spread.median)),
         ("NEES of the position", "3 is consistent", |row| row.nees.position),

@@ -260,8 +260,11 @@ fn read_truth(root: &Path, name: &str, listing: &mut Listing) -> Result<(), LogE
     })
 }
 
+/// A camera's calibration, and width and height of its images.
+type SizedCamera = (CameraConfig, (usize, usize));
+
 /// Calibration and size of a camera's images, where its folder tells them.
-fn calibrated(folder: &Path) -> Result<Option<(CameraConfig, (usize, usize))>, LogError> {
+fn calibrated(folder: &Path) -> Result<Option<SizedCamera>, LogError> {
     folder.join(CALIBRATION).is_file().then(|| camera(folder)).transpose()
 }
 

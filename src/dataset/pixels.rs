@@ -109,7 +109,7 @@ pub(super) fn raw_color(raw: &RawImage, config: &LogConfig) -> Result<ColorImage
 }
 
 fn require_even(raw: &RawImage, height_too: bool) -> Result<(), Rejection> {
-    let is_even = raw.width % 2 == 0 && (!height_too || raw.height % 2 == 0);
+    let is_even = raw.width.is_multiple_of(2) && (!height_too || raw.height.is_multiple_of(2));
     let detail = || format!("{}x{} pixels of {}", raw.width, raw.height, raw.encoding);
     is_even
         .then_some(())

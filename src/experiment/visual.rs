@@ -209,7 +209,7 @@ fn trial(drives: &Drives, rng: &mut ChaCha8Rng) -> Result<Trial, MatrixFisherErr
                 None => kind.start(&config, propagator.clone(), belief),
                 Some(attitude) => kind.start_broad(&config, propagator.clone(), belief, attitude),
             };
-            let errors = drive(&contender, filter, &config, &scene, &map);
+            let errors = drive(contender, filter, &config, &scene, &map);
             errors.record(case, contender, &mut trial);
         }
     }

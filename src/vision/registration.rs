@@ -72,7 +72,7 @@ fn covered(first: f64, second: f64, count: usize) -> std::ops::Range<usize> {
     let from = low.ceil().min(middle).max(0.0);
     // A centre on the border between two pixels belongs to the second one.
     let to = high.ceil().max(middle + 1.0).min(count as f64);
-    if !(from < to) {
+    if from >= to || from.is_nan() || to.is_nan() {
         return 0..0;
     }
     from as usize..to as usize

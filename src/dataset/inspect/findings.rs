@@ -469,7 +469,7 @@ fn clocks(findings: &mut Findings, inspection: &Inspection) {
             let text = format!(
                 "stamps of {source} are {interval:.3e} s apart: they are {unit}, not seconds"
             );
-            findings.add(Severity::Error, *role, text);
+            findings.add(Severity::Error, role, text);
         }
     }
     for (first, second) in [("imu", "color"), ("imu", "depth"), ("depth", "color")] {
@@ -481,7 +481,7 @@ fn clocks(findings: &mut Findings, inspection: &Inspection) {
                  they are of different clocks",
                 x.first, x.last, y.first, y.last
             );
-            findings.add(Severity::Error, *role, text);
+            findings.add(Severity::Error, role, text);
         }
     }
 }
