@@ -137,8 +137,8 @@ fn the_alignment_invents_no_attitude_error() {
         let disturbed = |seed: usize| -> Vec<[f64; 8]> {
             let mut rows = exact.clone();
             for (n, row) in rows.iter_mut().enumerate() {
-                for k in 1..4 {
-                    row[k] += sigma * noise(seed + 7 * n + k);
+                for (k, coordinate) in row.iter_mut().enumerate().skip(1).take(3) {
+                    *coordinate += sigma * noise(seed + 7 * n + k);
                 }
             }
             rows
