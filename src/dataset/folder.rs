@@ -48,6 +48,11 @@ impl Listing {
         self.entries.iter().any(|(_, entry)| matches!(entry, Entry::Truth(_)))
     }
 
+    /// Whether gyroscope and accelerometer come apart.
+    pub fn has_split_imu(&self) -> bool {
+        self.entries.iter().any(|(_, entry)| matches!(entry, Entry::Accelerometer(_)))
+    }
+
     /// Number of color and depth pairs.
     pub fn frames(&self, config: &LogConfig) -> u64 {
         let mut pairer = Pairer::new((config.max_pair_difference * 1e9).round() as i64);

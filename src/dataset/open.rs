@@ -179,15 +179,17 @@ pub fn open_with_faults(
             let (summary, listing) = *folder;
             let stereo = listing.stereo.clone();
             let registration = listing.registration.clone();
+            let is_split = listing.has_split_imu();
             let source = UnitedSource::new(FolderSource::new(listing, log, imu), imu);
             let source = RegisteredSource::new(source, registration);
             let source = FaultySource::new(ReferenceOfImu::new(source, log), faults, imu);
             match stereo {
                 Some(rig) => stereo_log(source, summary, rig, log),
                 None => {
-                    // The entries are sorted already, unless their stamps were spoilt.
+                    // The entries are sorted already, unless their stamps were spoilt, or the halves
+                    // of an IMU wait for each other while all else goes on.
                     let sorted = LogConfig { reorder_window: 0.0, ..log.clone() };
-                    let order = if faults.is_empty() { &sorted } else { log };
+                    let order = if faults.is_empty() && !is_split { &sorted } else { log };
                     Box::new(MergedLog::new(source, summary, order))
                 }
             }
