@@ -547,7 +547,7 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "fails: half a turn too much"]
+    #[ignore = "fails at exactly half a turn"]
     fn an_attitude_is_levelled_by_the_smallest_turn() {
         let attitude = exp(&Vector3::new(0.4, -1.0, 0.7));
         let own = attitude.inverse() * Vector3::z();
