@@ -114,11 +114,12 @@ pub struct AttitudeAlignment {
     pub by_positions: Option<f64>,
 }
 
-/// The alignment of positions ([`align`]), unless the attitudes contradict it and the positions
-/// hardly mind: where the rotation of least squares over positions *and* attitudes, each weighted
-/// by its own residuals, more than halves the attitude error and makes the mean square position
-/// error at most twice as large, that one is taken. So a run that stands still or goes straight is
-/// not told an attitude error that only its alignment has.
+/// The alignment of positions ([`align`]), unless they do not determine it and the attitudes
+/// contradict it: where reference and estimate share less than a quarter of the variance that
+/// decides the rotation, and the rotation of least squares over positions *and* attitudes, each
+/// weighted by its own residuals, more than halves the attitude error and makes the mean square
+/// position error at most twice as large, that one is taken. So a run that stands still or goes
+/// straight is not told an attitude error that only its alignment has.
 pub fn align_attitudes(
     pairs: &PosePairs,
     alignment: Alignment,
@@ -126,6 +127,9 @@ pub fn align_attitudes(
 ) -> Result<AttitudeAlignment, EvaluationError> {
     let fit = Fit::new(pairs, alignment, n)?;
     let plain = AttitudeAlignment { similarity: fit.similarity, by_positions: None };
+    if fit.moments.shared_variance(alignment) >= DETERMINED {
+        return Ok(plain);
+    }
     let Some(joint) = fit.joint() else { return Ok(plain) };
     let (positions, attitudes) = (fit.residuals(&fit.similarity), fit.residuals(&joint));
     let is_better = 4.0 * attitudes.attitude < positions.attitude
@@ -154,6 +158,9 @@ struct Residuals {
     attitude: f64,
 }
 
+/// Share of the variance of the positions above which they determine a rotation. The published
+/// results of VCU-RVI, which drift by more than their path is wide, share a third or more.
+const DETERMINED: f64 = 0.25;
 /// Weight of the attitudes where they decide only what the positions leave open.
 const FAINT: f64 = 1e-9;
 /// Mean square attitude errors below this are rounding, rad^2.
@@ -239,8 +246,8 @@ pub(super) struct PointMoments {
     estimate_mean: Vector3<f64>,
     /// Mean of `(reference - mean)(estimate - mean)^T`, m^2.
     covariance: Matrix3<f64>,
-    /// Mean of `|estimate - mean|^2`, m^2.
-    estimate_variance: f64,
+    reference_covariance: Matrix3<f64>,
+    estimate_covariance: Matrix3<f64>,
 }
 
 impl PointMoments {
@@ -250,19 +257,37 @@ impl PointMoments {
             poses.iter().fold(Vector3::zeros(), |sum, pose| sum + pose.translation.vector) / n
         };
         let (reference_mean, estimate_mean) = (mean(reference), mean(estimate));
-        let mut covariance = Matrix3::zeros();
-        let mut estimate_variance = 0.0;
+        let [mut covariance, mut reference_covariance, mut estimate_covariance] =
+            [Matrix3::zeros(); 3];
         for (r, e) in reference.iter().zip(estimate) {
+            let r = r.translation.vector - reference_mean;
             let e = e.translation.vector - estimate_mean;
-            covariance += (r.translation.vector - reference_mean) * e.transpose();
-            estimate_variance += e.norm_squared();
+            covariance += r * e.transpose();
+            reference_covariance += r * r.transpose();
+            estimate_covariance += e * e.transpose();
         }
         Self {
             reference_mean,
             estimate_mean,
             covariance: covariance / n,
-            estimate_variance: estimate_variance / n,
+            reference_covariance: reference_covariance / n,
+            estimate_covariance: estimate_covariance / n,
         }
+    }
+
+    /// The share of variance that reference and estimate have in common along the direction that
+    /// decides the rotation: the second most extended one in space, the first one for the heading.
+    fn shared_variance(&self, alignment: Alignment) -> f64 {
+        let (dimensions, deciding) = if alignment == Alignment::Yaw { (2, 0) } else { (3, 1) };
+        let part = |covariance: &Matrix3<f64>| {
+            let part = covariance.view((0, 0), (dimensions, dimensions)).into_owned();
+            let mut values = part.singular_values();
+            values.as_mut_slice().sort_by(|a, b| b.total_cmp(a));
+            values[deciding]
+        };
+        let variances = part(&self.reference_covariance) * part(&self.estimate_covariance);
+        let share = part(&self.covariance).powi(2) / variances;
+        if share.is_finite() { share } else { 0.0 }
     }
 
     pub(super) fn rotation(&self) -> Option<UnitQuaternion<f64>> {
@@ -272,7 +297,8 @@ impl PointMoments {
     /// Least-squares scale for a given rotation (Umeyama 1991, eq. 42); NaN for a point.
     pub(super) fn scale(&self, rotation: &UnitQuaternion<f64>) -> f64 {
         let rotation = rotation.to_rotation_matrix();
-        (rotation.matrix().transpose() * self.covariance).trace() / self.estimate_variance
+        let covariance = rotation.matrix().transpose() * self.covariance;
+        covariance.trace() / self.estimate_covariance.trace()
     }
 
     /// Centre on centre; `None` where a scale is wanted and not determined.
