@@ -349,6 +349,18 @@ pub enum FilterError {
     FewContradict { points: usize, nis: f64 },
     #[error("{points} points would turn the body much further than their innovations allow")]
     TurnsTooFar { points: usize },
+    #[error("the window has no pose {0}: it has been dropped, or never was")]
+    UnknownClone(u64),
+    #[error("there is no camera {camera}: {cameras} are given")]
+    UnknownCamera { camera: usize, cameras: usize },
+    #[error("the row of track {track} at pose {clone} has been used already")]
+    RowUsedTwice { track: u64, clone: u64 },
+    #[error("{rows} rows of track {track} say nothing beyond where its point is")]
+    TooFewRows { track: u64, rows: usize },
+    #[error("no point in front of the cameras fits track {0}")]
+    NoPoint(u64),
+    #[error("track {track} is improbable: squared distance {squared:.1} in {rows} rows")]
+    ImprobableTrack { track: u64, squared: f64, rows: usize },
     #[error("the {0} is part of the state already")]
     AlreadyEstimated(&'static str),
     #[error("this filter needs the specific force")]

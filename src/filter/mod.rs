@@ -15,8 +15,10 @@ pub use core::{
 };
 pub use linear::{Correction, LinearMeasurement};
 pub use visual::{
-    AttitudeDensity, BodyPoints, Calibration, Candidate, ErrorState, FilterConfig, FilterKind,
-    FrameChange, Gating, KnownAttitude, MapRefinement, MapTreatment, Mekf, MfgFilter,
-    PointObservation, PointState, PointUpdate, PoseSpread, SlamFilter, UpdateMethod,
-    VisualInertialFilter, ZeroVelocity, calibration_block, choose_points, point_by_pose,
+    AttitudeDensity, BodyPoints, Calibration, Candidate, CloneId, ClonedPose, ErrorState,
+    FilterConfig, FilterKind, FrameChange, Gating, KnownAttitude, MapRefinement, MapTreatment,
+    Mekf, MfgFilter, MountedCamera, PointObservation, PointState, PointUpdate, PoseSpread,
+    PoseWindow, SlamFilter, Track, TrackDepth, TrackOutcome, TrackUpdate, TrackUse, TrackView,
+    UpdateMethod, VisualInertialFilter, ZeroVelocity, calibration_block, choose_points,
+    point_by_pose,
 };

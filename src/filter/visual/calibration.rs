@@ -118,7 +118,7 @@ impl BodyMotion {
 
     /// The motion, each part zero where it is slow. Noise differs from frame to frame, and taken
     /// for motion it would seem to reveal an offset of the clock that cannot be seen at rest.
-    fn beyond_noise(&self) -> Self {
+    pub fn beyond_noise(&self) -> Self {
         let real = |v: &Vector3<f64>| if v.norm() > Self::STILL { *v } else { Vector3::zeros() };
         Self { angular_velocity: real(&self.angular_velocity), velocity: real(&self.velocity) }
     }

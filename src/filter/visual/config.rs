@@ -51,6 +51,11 @@ pub struct FilterConfig {
     pub state_min_observations: u32,
     /// Points of the state not seen for more than this many frames make room for others.
     pub state_max_unseen_frames: u64,
+    /// Most rows of tracks, after elimination of their points, in one update.
+    pub track_rows: usize,
+    /// Probability with which a track that fits the model is taken for improbable (chi-square of
+    /// its rows); 0: never.
+    pub track_false_alarm: f64,
     /// Standard deviation of the initial velocity, m/s.
     pub velocity_sd: f64,
     /// Standard deviation of the initial position, m.
@@ -89,6 +94,8 @@ impl Default for FilterConfig {
             state_points: 100,
             state_min_observations: 5,
             state_max_unseen_frames: 5,
+            track_rows: 150,
+            track_false_alarm: 1e-3,
             velocity_sd: 0.1,
             position_sd: 1e-3,
             tilt_sd_deg: 1.0,

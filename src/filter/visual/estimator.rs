@@ -6,6 +6,7 @@ use super::body_points::BodyPoints;
 use super::calibration::Calibration;
 use super::config::MapTreatment;
 use super::map_points::{self, MapRefinement};
+use super::slam::PoseWindow;
 use super::zero_velocity::ZeroVelocity;
 use crate::alignment::{MapEstimate, PointPair};
 use crate::filter::core::{BayesFilter, FilterError};
@@ -56,6 +57,16 @@ pub trait VisualInertialFilter: BayesFilter {
 
     /// The same, to be changed.
     fn point_state_mut(&mut self) -> Option<&mut dyn PointState> {
+        None
+    }
+
+    /// The window of past poses of the state, if the filter keeps one.
+    fn pose_window(&self) -> Option<&dyn PoseWindow> {
+        None
+    }
+
+    /// The same, to be changed.
+    fn pose_window_mut(&mut self) -> Option<&mut dyn PoseWindow> {
         None
     }
 

@@ -8,7 +8,7 @@ use super::config::FilterConfig;
 use super::estimator::{FrameChange, PointState, PointUpdate, VisualInertialFilter};
 use super::kind::FilterKind;
 use super::mfg::MfgFilter;
-use super::slam::{AttitudeDensity, ErrorState, SlamFilter};
+use super::slam::{AttitudeDensity, ErrorState, PoseWindow, SlamFilter};
 use super::zero_velocity::ZeroVelocity;
 use crate::alignment::PointPair;
 use crate::distribution::matrix_fisher::MatrixFisher;
@@ -136,6 +136,14 @@ impl VisualInertialFilter for HandOver {
 
     fn point_state_mut(&mut self) -> Option<&mut dyn PointState> {
         self.filter_mut().point_state_mut()
+    }
+
+    fn pose_window(&self) -> Option<&dyn PoseWindow> {
+        self.filter().pose_window()
+    }
+
+    fn pose_window_mut(&mut self) -> Option<&mut dyn PoseWindow> {
+        self.filter_mut().pose_window_mut()
     }
 
     fn calibrate(&mut self, prior: &Calibration) -> Result<(), FilterError> {

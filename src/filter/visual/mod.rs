@@ -30,6 +30,9 @@ pub use map_points::{MapRefinement, point_by_pose};
 pub use mekf::Mekf;
 pub use mfg::MfgFilter;
 pub use selection::{Candidate, choose_points};
-pub use slam::{AttitudeDensity, ErrorState, SlamFilter};
+pub use slam::{
+    AttitudeDensity, CloneId, ClonedPose, ErrorState, MountedCamera, PoseWindow, SlamFilter, Track,
+    TrackDepth, TrackOutcome, TrackUpdate, TrackUse, TrackView,
+};
 pub use start::KnownAttitude;
 pub use zero_velocity::ZeroVelocity;

@@ -7,6 +7,7 @@ use nalgebra::{DMatrix, Matrix3, UnitQuaternion, Vector3};
 
 use super::gravity::UnknownGravity;
 use super::state::{Block, JointState, NAVIGATION};
+use super::window::CLONE;
 use crate::filter::core::FilterError;
 use crate::filter::linear::LinearMeasurement;
 use crate::inertial::block;
@@ -87,6 +88,12 @@ impl JointState {
         set(block::ROTATION, gravity.rotation_by_gravity(&state.world_from_body.rotation));
         set(block::VELOCITY, gravity.vector_by_gravity(&state.velocity));
         set(block::POSITION, gravity.vector_by_gravity(position));
+        let base = self.row(Block::Clone(0));
+        for (slot, clone) in self.clones.iter().enumerate() {
+            let (row, pose) = (base + CLONE * slot, &clone.world_from_body);
+            set(row, gravity.rotation_by_gravity(&pose.rotation));
+            set(row + 3, gravity.vector_by_gravity(&pose.translation.vector));
+        }
         let base = self.row(Block::Point(0));
         for (slot, point) in self.points.iter().enumerate() {
             set(base + 3 * slot, gravity.vector_by_gravity(&point.position));

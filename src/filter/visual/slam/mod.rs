@@ -6,7 +6,9 @@ mod regression;
 mod state;
 #[cfg(test)]
 mod tests;
+mod track;
 mod update;
+mod window;
 
 use nalgebra::{Dyn, Isometry3, Matrix3, OMatrix, Rotation3, U3, Vector3};
 
@@ -31,6 +33,10 @@ use state::{Block, JointState, StatePoint};
 /// `(pi^2 / 3 + 2) / 3`.
 pub(super) const UNIFORM_VARIANCE: f64 = 1.763_289_378_698_817_6;
 pub use regression::{AttitudeDensity, ErrorState};
+pub use track::{
+    CloneId, ClonedPose, MountedCamera, PoseWindow, Track, TrackDepth, TrackOutcome, TrackUpdate,
+    TrackUse, TrackView,
+};
 
 /// Visual-inertial filter whose Euclidean state is `(v, p, b_g, b_a, l_1 ... l_M)`, after `b_a`
 /// gravity while its direction is unknown and the [`Calibration`] where it is estimated.
@@ -250,6 +256,14 @@ impl VisualInertialFilter for SlamFilter {
     }
 
     fn point_state_mut(&mut self) -> Option<&mut dyn PointState> {
+        Some(self)
+    }
+
+    fn pose_window(&self) -> Option<&dyn PoseWindow> {
+        Some(self)
+    }
+
+    fn pose_window_mut(&mut self) -> Option<&mut dyn PoseWindow> {
         Some(self)
     }
 

@@ -1,15 +1,16 @@
 //! The regression of the Euclidean state on the rotation, and how points condition it.
 
+use std::ops::Range;
+
 use nalgebra::{DMatrix, Dyn, Matrix3, OMatrix, Rotation3, SMatrix, SVector, U3, Vector3};
 
 use crate::distribution::rotation_quadratic::{
     RotationQuadratic, rotated_vector_by_rotation, vectorize,
 };
-use crate::filter::visual::calibration::CALIBRATION_BLOCKS;
 use crate::so3;
 
 /// Blocks of the Euclidean part that are no vectors of the world but of the body.
-const BIASES: std::ops::Range<usize> = 2..4;
+const BIASES: Range<usize> = 2..4;
 /// The position's block of the Euclidean part.
 const POSITION: usize = 1;
 /// Points that are conditioned on at once. Their innovations are decorrelated by substitution,
@@ -77,8 +78,8 @@ pub(super) struct Regression<'a> {
     error: ErrorState,
     prior: &'a Rotation3<f64>,
     prior_means: &'a [Vector3<f64>],
-    /// First block of the calibration of the camera, which is no vector of the world either.
-    calibration: Option<usize>,
+    /// Blocks of the calibration and of cloned poses, which are no vectors of the world either.
+    unturned: Range<usize>,
     rotation_information: Matrix3<f64>,
     rotation_covariance: Matrix3<f64>,
     slope: DMatrix<f64>,
@@ -112,13 +113,13 @@ pub(super) struct Posterior {
 
 impl<'a> Regression<'a> {
     /// Of a concentrated belief: the mode of the rotation, the means of the blocks of three of
-    /// the Euclidean part (from `calibration` on, where given, those of the camera's calibration),
-    /// and the covariance of both. `None` if the rotation's is not positive definite.
+    /// the Euclidean part (of which those in `unturned` are no vectors of the world), and the
+    /// covariance of both. `None` if the rotation's is not positive definite.
     pub fn of_prior(
         error: ErrorState,
         prior: &'a Rotation3<f64>,
         prior_means: &'a [Vector3<f64>],
-        calibration: Option<usize>,
+        unturned: Range<usize>,
         covariance: &DMatrix<f64>,
     ) -> Option<Self> {
         let n = covariance.ncols() - 3;
@@ -134,7 +135,7 @@ impl<'a> Regression<'a> {
             error,
             prior,
             prior_means,
-            calibration,
+            unturned,
             rotation_information,
             rotation_covariance,
             slope: DMatrix::zeros(n, error.size()),
@@ -157,10 +158,7 @@ impl<'a> Regression<'a> {
 
     /// Whether a block of `x_0` turns with the body.
     fn turns(&self, block: usize) -> bool {
-        let calibrates = self
-            .calibration
-            .is_some_and(|first| (first..first + CALIBRATION_BLOCKS).contains(&block));
-        self.error.is_invariant() && !BIASES.contains(&block) && !calibrates
+        self.error.is_invariant() && !BIASES.contains(&block) && !self.unturned.contains(&block)
     }
 
     /// Squared Mahalanobis distance of each measurement from what is expected of it.

@@ -10,6 +10,8 @@ use nalgebra::{
 };
 
 use super::gravity::UnknownGravity;
+use super::regression::ErrorState;
+use super::window::{CLONE, PoseClone};
 use crate::filter::visual::calibration::{BodyMotion, CALIBRATION_BLOCKS, Calibration};
 use crate::filter::visual::estimator::PoseSpread;
 use crate::inertial::{Belief, NavCovariance, block};
@@ -24,6 +26,8 @@ pub(super) enum Block {
     Gravity,
     /// The camera's rotation, translation and, in the first row, clock offset.
     Calibration(usize),
+    /// A cloned pose, by its place in the window: three rows of its rotation, three of its position.
+    Clone(usize),
     /// A map point, by its place in the order of admission.
     Point(usize),
 }
@@ -36,11 +40,15 @@ pub(super) struct StatePoint {
     pub position: Vector3<f64>,
 }
 
-/// Mean and covariance of navigation part, gravity and calibration (where they are estimated) and
-/// map points, in this order.
+/// Mean and covariance of navigation part, gravity and calibration (where they are estimated),
+/// cloned poses and map points, in this order.
 #[derive(Debug, Clone)]
 pub(super) struct JointState {
     pub belief: Belief,
+    /// The window of past poses, in the order of their rows, oldest first.
+    pub clones: Vec<PoseClone>,
+    /// How many poses have been cloned so far.
+    pub clones_taken: u64,
     /// In the order of their rows.
     pub points: Vec<StatePoint>,
     /// Its navigation rows and columns date from the last update; [`Self::synchronize`] brings them
@@ -60,6 +68,8 @@ impl JointState {
     pub fn new(belief: Belief, points: usize) -> Self {
         Self {
             belief,
+            clones: Vec::new(),
+            clones_taken: 0,
             points: Vec::with_capacity(points),
             covariance: DMatrix::from_fn(NAVIGATION, NAVIGATION, |i, j| belief.covariance[(i, j)]),
             transition: NavCovariance::identity(),
@@ -76,7 +86,10 @@ impl JointState {
         match block {
             Block::Gravity => NAVIGATION,
             Block::Calibration(k) => after_gravity + 3 * k,
-            Block::Point(slot) => after_gravity + calibration + 3 * slot,
+            Block::Clone(slot) => after_gravity + calibration + CLONE * slot,
+            Block::Point(slot) => {
+                after_gravity + calibration + CLONE * self.clones.len() + 3 * slot
+            }
         }
     }
 
@@ -86,14 +99,20 @@ impl JointState {
     }
 
     pub fn calibration_rows(&self) -> Range<usize> {
-        self.row(Block::Calibration(0))..self.row(Block::Point(0))
+        self.row(Block::Calibration(0))..self.row(Block::Clone(0))
+    }
+
+    /// Blocks of the Euclidean part that are no vectors of the world: calibration and cloned poses.
+    pub fn unturned_blocks(&self) -> Range<usize> {
+        self.euclidean_index(Block::Calibration(0))..self.euclidean_index(Block::Point(0))
     }
 
     pub fn slot(&self, id: u64) -> Option<usize> {
         self.points.iter().position(|point| point.id == id)
     }
 
-    /// Mean of the Euclidean part in the order of the covariance's rows after the rotation.
+    /// Mean of the Euclidean part in the order of the covariance's rows after the rotation; that of
+    /// the error for poses.
     pub fn euclidean(&self) -> Vec<Vector3<f64>> {
         let state = &self.belief.state;
         let mut blocks = vec![Vector3::zeros(); NAVIGATION / 3 - 1];
@@ -103,6 +122,7 @@ impl JointState {
         blocks[block::ACCEL_BIAS / 3 - 1] = state.accel_bias;
         blocks.extend(self.gravity.as_ref().map(|gravity| gravity.mean));
         blocks.extend(self.calibration.iter().flat_map(Calibration::blocks));
+        blocks.extend(std::iter::repeat_n(Vector3::zeros(), CLONE / 3 * self.clones.len()));
         blocks.extend(self.points.iter().map(|point| point.position));
         blocks
     }
@@ -211,11 +231,16 @@ impl JointState {
     /// Turns everything in world coordinates; the covariance is up to date.
     pub fn turn_world(&mut self, turn: &UnitQuaternion<f64>) {
         let matrix = turn.to_rotation_matrix().into_inner();
-        let calibration = self.calibration_rows();
+        let (calibration, clones) = (self.calibration_rows(), self.row(Block::Clone(0)));
+        let points = self.row(Block::Point(0));
+        let turns = |row: &usize| {
+            let of_pose = (clones..points).contains(row);
+            !calibration.contains(row) && !(of_pose && (row - clones).is_multiple_of(CLONE))
+        };
         let world_blocks = [block::VELOCITY, block::POSITION]
             .into_iter()
             .chain((NAVIGATION..self.covariance.ncols()).step_by(3))
-            .filter(|row| !calibration.contains(row));
+            .filter(turns);
         for row in world_blocks {
             let rows = matrix * self.covariance.rows(row, 3);
             self.covariance.rows_mut(row, 3).copy_from(&rows);
@@ -225,6 +250,9 @@ impl JointState {
         let state = &mut self.belief.state;
         state.world_from_body = turn * state.world_from_body;
         state.velocity = turn * state.velocity;
+        for clone in &mut self.clones {
+            clone.world_from_body = turn * clone.world_from_body;
+        }
         for point in &mut self.points {
             point.position = turn * point.position;
         }
@@ -243,6 +271,11 @@ impl JointState {
         let covariance = self.with_camera(covariance, -1.0);
         let navigation = change.fixed_rows::<NAVIGATION>(0).into_owned();
         self.belief.state = self.belief.state.corrected_by(&navigation);
+        let base = self.row(Block::Clone(0));
+        for (slot, clone) in self.clones.iter_mut().enumerate() {
+            let row = base + CLONE * slot;
+            clone.shift(ErrorState::So3xRn, &part(row), &part(row + 3));
+        }
         let base = self.row(Block::Point(0));
         for (slot, point) in self.points.iter_mut().enumerate() {
             point.position += part(base + 3 * slot);

@@ -12,6 +12,7 @@ use super::SlamFilter;
 use super::gravity::UnknownGravity;
 use super::regression::{Expansion, Measurement, Posterior, Regression};
 use super::state::{Block, JointState};
+use super::window::{CLONE, CloneErrors, PoseClone};
 use crate::filter::core::FilterError;
 use crate::filter::visual::estimator::{FrameChange, Gating, PointUpdate, contradicts};
 use crate::inertial::block;
@@ -130,10 +131,11 @@ impl SlamFilter {
         let state = &self.state;
         let prior = state.belief.state.world_from_body.rotation.to_rotation_matrix();
         let means = state.euclidean();
-        let calibration = state.calibration.map(|_| state.euclidean_index(Block::Calibration(0)));
-        let seen = calibration.map(|_| state.with_camera(state.covariance.clone(), -1.0));
-        let covariance = seen.as_ref().unwrap_or(&state.covariance);
-        let of_prior = || Regression::of_prior(self.error, &prior, &means, calibration, covariance);
+        let changed = self.changed_coordinates();
+        let covariance = changed.as_ref().unwrap_or(&state.covariance);
+        let unturned = state.unturned_blocks();
+        let of_prior =
+            || Regression::of_prior(self.error, &prior, &means, unturned.clone(), covariance);
         let mut regression = of_prior().ok_or(FilterError::NotPositive("rotation covariance"))?;
         let distances = regression.squared_distances(measurements).ok_or(NO_POSTERIOR)?;
         let gating = self.gate.judge(distances.into_iter());
@@ -162,6 +164,17 @@ impl SlamFilter {
         let distance = self.turn_distance(&turn).ok_or(NO_POSTERIOR)?;
         let turns_too_far = distance > MOST_TURN * explained.max(NOISE_TURN);
         Ok(Conditioned { posterior, nis, points, gating, turns_too_far })
+    }
+
+    /// The covariance in the coordinates in which points condition it, where they are not those of
+    /// the state.
+    fn changed_coordinates(&self) -> Option<DMatrix<f64>> {
+        let state = &self.state;
+        if state.calibration.is_none() && state.clones.is_empty() {
+            return None;
+        }
+        let seen = state.with_camera(state.covariance.clone(), -1.0);
+        Some(state.with_clone_errors(self.error, seen, CloneErrors::ForUpdate))
     }
 
     /// Squared Mahalanobis distance of a turn of the body from the belief.
@@ -202,6 +215,8 @@ impl SlamFilter {
         }
         let mut moved = JointState {
             belief,
+            clones: self.moved_clones(&means),
+            clones_taken: self.state.clones_taken,
             points: self.state.points.clone(),
             covariance: DMatrix::zeros(0, 0),
             transition: self.state.transition,
@@ -210,9 +225,21 @@ impl SlamFilter {
             measured_rate: self.state.measured_rate,
         };
         self.place_points(&mut moved, &means);
+        let covariance = moved.with_clone_errors(self.error, covariance, CloneErrors::Stored);
         moved.covariance = moved.with_camera(covariance, 1.0);
         moved.renew_belief_covariance();
         Ok(moved)
+    }
+
+    /// The poses of the window, each moved by its own error.
+    fn moved_clones(&self, means: &[Vector3<f64>]) -> Vec<PoseClone> {
+        let mut clones = self.state.clones.clone();
+        let first = self.state.euclidean_index(Block::Clone(0));
+        let errors = means[first..].chunks_exact(CLONE / 3);
+        for (clone, errors) in clones.iter_mut().zip(errors) {
+            clone.shift(self.error, &errors[0], &errors[1]);
+        }
+        clones
     }
 
     /// Points where the camera, as it is mounted now, sees what was found for them.
