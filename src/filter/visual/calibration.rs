@@ -85,10 +85,16 @@ impl Calibration {
         in_body: &Vector3<f64>,
         motion: &BodyMotion,
     ) -> [Matrix3<f64>; CALIBRATION_BLOCKS] {
-        let from_camera = in_body - self.body_from_camera.translation.vector;
+        let [by_turn, by_shift] = self.by_mounting(in_body);
         let mut by_offset = Matrix3::zeros();
         by_offset.set_column(0, &motion.of(in_body));
-        [-from_camera.cross_matrix(), Matrix3::identity(), by_offset]
+        [by_turn, by_shift, by_offset]
+    }
+
+    /// The same by the mounting alone. All cameras of the body are mounted on the first.
+    pub(super) fn by_mounting(&self, in_body: &Vector3<f64>) -> [Matrix3<f64>; 2] {
+        let from_camera = in_body - self.body_from_camera.translation.vector;
+        [-from_camera.cross_matrix(), Matrix3::identity()]
     }
 
     /// Where a point is in the body that was read off with another calibration, at `in_body`.

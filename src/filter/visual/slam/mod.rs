@@ -3,10 +3,17 @@
 mod gravity;
 mod levelling;
 mod regression;
+mod rows;
 mod state;
 #[cfg(test)]
 mod tests;
 mod track;
+#[cfg(test)]
+mod track_lab;
+#[cfg(test)]
+mod track_tests;
+mod track_update;
+mod triangulation;
 mod update;
 mod window;
 
@@ -27,6 +34,7 @@ use crate::filter::core::{BayesFilter, Estimate, FilterError, InertialStep};
 use crate::inertial::{Belief, NavCovariance, Propagator, block};
 use crate::so3::{self, ProperSvd};
 use regression::{Measurement, Target};
+use rows::TrackGate;
 use state::{Block, JointState, StatePoint};
 
 /// Variance of each component of the rotation vector of a uniform rotation, rad^2:
@@ -64,6 +72,7 @@ pub struct SlamFilter {
     /// Whether the heading is that of an arbitrary world: uniform, and independent of all else.
     heading_is_free: bool,
     gate: Gate,
+    track_gate: TrackGate,
 }
 
 impl SlamFilter {
@@ -84,6 +93,7 @@ impl SlamFilter {
             carried: 0.0,
             heading_is_free: false,
             gate: Gate::new(config),
+            track_gate: TrackGate::new(config.track_false_alarm),
         }
     }
 
@@ -220,6 +230,9 @@ impl VisualInertialFilter for SlamFilter {
     fn update_zero_velocity(&mut self, rest: &ZeroVelocity) -> Result<FrameChange, FilterError> {
         self.state.synchronize();
         let measurement = rest.linearized(&self.state.belief.state);
+        if !self.state.clones.is_empty() {
+            return self.update_linear(&measurement);
+        }
         let correction = measurement.condition(&self.state.covariance)?;
         let mut state = self.state.clone();
         correction.reduce(&mut state.covariance);

@@ -2,20 +2,23 @@
 
 use std::ops::Range;
 
-use nalgebra::{DMatrix, Dyn, Matrix3, OMatrix, Rotation3, SMatrix, SVector, U3, Vector3};
+use nalgebra::{DMatrix, DVector, Dyn, Matrix3, OMatrix, Rotation3, SMatrix, SVector, U3, Vector3};
 
+use super::rows::UpdateRows;
 use crate::distribution::rotation_quadratic::{
     RotationQuadratic, rotated_vector_by_rotation, vectorize,
 };
 use crate::so3;
 
 /// Blocks of the Euclidean part that are no vectors of the world but of the body.
-const BIASES: Range<usize> = 2..4;
+pub(super) const BIASES: Range<usize> = 2..4;
 /// The position's block of the Euclidean part.
 const POSITION: usize = 1;
 /// Points that are conditioned on at once. Their innovations are decorrelated by substitution,
 /// whose cost grows with the size of the batch; all that follows is matrix products.
 const BATCH: usize = 16;
+/// The same in rows.
+const BATCH_ROWS: usize = 3 * BATCH;
 /// Columns of the covariance that are updated at once, a multiple of three.
 const PANEL: usize = 96;
 
@@ -93,7 +96,7 @@ pub(super) struct Regression<'a> {
 pub(super) struct Expansion {
     pub mode: Rotation3<f64>,
     /// `u` of the blocks of the Euclidean part.
-    moved: Vec<Vector3<f64>>,
+    pub moved: Vec<Vector3<f64>>,
 }
 
 impl Expansion {
@@ -192,11 +195,66 @@ impl<'a> Regression<'a> {
             self.condition_batch(batch, noises, expansion)?;
         }
 
+        let squared = self.squared_innovation()?;
+        Some(squared / (3.0 * measurements.len() as f64))
+    }
+
+    /// Squared Mahalanobis distance of all innovations so far.
+    fn squared_innovation(&self) -> Option<f64> {
+        let at_prior = self.error.at_prior();
+        let derivative = self.error.derivative(self.prior);
         let total = (at_prior.transpose() * &self.evidence * &at_prior)[(0, 0)];
         let gradient = derivative.transpose() * &self.evidence * &at_prior;
         let explained = self.information().cholesky()?.solve(&gradient.fixed_view::<3, 1>(0, 0));
         let explained = gradient.fixed_view::<3, 1>(0, 0).dot(&explained);
-        Some((total - explained).max(0.0) / (3.0 * measurements.len() as f64))
+        Some((total - explained).max(0.0))
+    }
+
+    /// Bayes' rule for rows that are linear in the error where `expansion` came to, with errors
+    /// counted from the prediction: `0 = H (u - u_i) + H_e (e - e_i) - residual + noise`. Gives the
+    /// squared Mahalanobis distance of all innovations so far.
+    pub fn condition_rows(&mut self, rows: &UpdateRows, expansion: &Expansion) -> Option<f64> {
+        let count = rows.residual.len();
+        for first in (0..count).step_by(BATCH_ROWS) {
+            let len = BATCH_ROWS.min(count - first);
+            let h = rows.jacobian.rows(first, len);
+            let by_rotation = rows.by_rotation.rows(first, len);
+            let n = self.covariance.ncols();
+            let mut columns = DMatrix::zeros(n, h.ncols());
+            let mut slope = DMatrix::zeros(h.ncols(), self.error.size());
+            let mut moved = DVector::zeros(h.ncols());
+            for (k, block) in rows.blocks.iter().enumerate() {
+                columns.fixed_columns_mut::<3>(3 * k).copy_from(&self.columns(*block));
+                slope.rows_mut(3 * k, 3).copy_from(&self.slope.rows(3 * block, 3));
+                moved.fixed_rows_mut::<3>(3 * k).copy_from(&expansion.moved[*block]);
+            }
+            let mut cross = DMatrix::zeros(n, len);
+            cross.gemm(1.0, &columns, &h.transpose(), 0.0);
+            let mut innovation = DMatrix::identity(len, len);
+            for (k, block) in rows.blocks.iter().enumerate() {
+                let by_block = h.columns(3 * k, 3);
+                innovation.gemm(1.0, &by_block, &cross.rows(3 * block, 3), 1.0);
+            }
+            let turned = so3::log(&(self.prior.inverse() * expansion.mode));
+            let mut design = h * slope;
+            let mut by_coordinate = design.columns_mut(0, self.error.size() - 1);
+            by_coordinate += by_rotation * self.coordinate_by_y();
+            let mut constant = design.column_mut(self.error.size() - 1);
+            constant -= rows.residual.rows(first, len) + h * moved + by_rotation * turned;
+            self.absorb(cross, innovation, design)?;
+        }
+        self.squared_innovation()
+    }
+
+    /// Derivative by `y`, without its last entry, of the rotation error that the regression is on.
+    fn coordinate_by_y(&self) -> OMatrix<f64, U3, Dyn> {
+        let size = self.error.size() - 1;
+        if self.error.is_matrix_fisher() {
+            let sine = tangent_coordinate(self.prior.matrix());
+            OMatrix::<f64, U3, Dyn>::from_fn(size, |i, j| sine[(i, j)])
+        } else {
+            OMatrix::<f64, U3, Dyn>::identity(size)
+        }
     }
 
     /// Covariance of a measurement in world coordinates, as robust weighting leaves it, and its
@@ -338,6 +396,18 @@ impl<'a> Regression<'a> {
             let mut own = innovation.fixed_view_mut::<3, 3>(3 * i, 3 * i);
             own += noise;
         }
+        self.absorb(cross, innovation, design)
+    }
+
+    /// Bayes' rule for innovations of which the covariance with `x` given the rotation (n x m), their
+    /// own, and the derivative by `y` are given.
+    fn absorb(
+        &mut self,
+        mut cross: DMatrix<f64>,
+        innovation: DMatrix<f64>,
+        mut design: DMatrix<f64>,
+    ) -> Option<()> {
+        let m = innovation.ncols();
         let factor = innovation.cholesky()?.unpack();
         // Decorrelated innovations: the columns of `cross L^-T`.
         for j in 0..m {

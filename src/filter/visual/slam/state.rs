@@ -10,7 +10,7 @@ use nalgebra::{
 };
 
 use super::gravity::UnknownGravity;
-use super::regression::ErrorState;
+use super::regression::{BIASES, ErrorState};
 use super::window::{CLONE, PoseClone};
 use crate::filter::visual::calibration::{BodyMotion, CALIBRATION_BLOCKS, Calibration};
 use crate::filter::visual::estimator::PoseSpread;
@@ -105,6 +105,11 @@ impl JointState {
     /// Blocks of the Euclidean part that are no vectors of the world: calibration and cloned poses.
     pub fn unturned_blocks(&self) -> Range<usize> {
         self.euclidean_index(Block::Calibration(0))..self.euclidean_index(Block::Point(0))
+    }
+
+    /// Whether a block of the Euclidean part is a vector of the world.
+    pub fn turns(&self, block: usize) -> bool {
+        !BIASES.contains(&block) && !self.unturned_blocks().contains(&block)
     }
 
     pub fn slot(&self, id: u64) -> Option<usize> {

@@ -2,9 +2,8 @@
 
 use nalgebra::{Isometry3, Matrix2, Matrix6, Point2, Vector3};
 
-use super::SlamFilter;
 use crate::alignment::MapEstimate;
-use crate::filter::core::{BayesFilter, FilterError};
+use crate::filter::core::FilterError;
 use crate::filter::visual::estimator::FrameChange;
 use crate::sensor::Camera;
 
@@ -160,42 +159,4 @@ pub trait PoseWindow {
         tracks: &[Track],
         cameras: &[MountedCamera],
     ) -> Result<TrackUpdate, FilterError>;
-}
-
-impl PoseWindow for SlamFilter {
-    fn clone_pose(&mut self, later: f64) -> Result<CloneId, FilterError> {
-        self.state.clone_pose(later).ok_or(FilterError::NotFinite("pose of the window"))
-    }
-
-    fn clones(&self) -> Vec<CloneId> {
-        self.state.clones.iter().map(|clone| clone.id).collect()
-    }
-
-    fn cloned_pose(&self, id: CloneId) -> Option<ClonedPose> {
-        Some(self.state.cloned_pose(self.state.clone_slot(id)?))
-    }
-
-    fn drop_clone(&mut self, id: CloneId) -> bool {
-        let slot = self.state.clone_slot(id);
-        if let Some(slot) = slot {
-            self.state.remove_clone(slot);
-        }
-        slot.is_some()
-    }
-
-    fn triangulate(
-        &self,
-        track: &Track,
-        _cameras: &[MountedCamera],
-    ) -> Result<MapEstimate, FilterError> {
-        Err(FilterError::NoPoint(track.id))
-    }
-
-    fn update_tracks(
-        &mut self,
-        _tracks: &[Track],
-        _cameras: &[MountedCamera],
-    ) -> Result<TrackUpdate, FilterError> {
-        Err(self.cannot_use("track"))
-    }
 }

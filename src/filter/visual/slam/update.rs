@@ -6,14 +6,16 @@
 #![doc = include_str!("../../../../docs/theory/points.md")]
 #![doc = include_str!("../../../../docs/math.html")]
 
-use nalgebra::{DMatrix, Point3, UnitQuaternion, Vector3};
+use nalgebra::{Const, DMatrix, Point3, UnitQuaternion, Vector3};
 
 use super::SlamFilter;
 use super::gravity::UnknownGravity;
 use super::regression::{Expansion, Measurement, Posterior, Regression};
-use super::state::{Block, JointState};
+use super::rows::StateRows;
+use super::state::{Block, JointState, NAVIGATION};
 use super::window::{CLONE, CloneErrors, PoseClone};
-use crate::filter::core::FilterError;
+use crate::filter::core::{BayesFilter, FilterError};
+use crate::filter::linear::LinearMeasurement;
 use crate::filter::visual::estimator::{FrameChange, Gating, PointUpdate, contradicts};
 use crate::inertial::block;
 use crate::so3;
@@ -22,7 +24,7 @@ use crate::so3;
 const FEW_POINTS: usize = 8;
 /// An attitude that moved further than this in an update is found anew with the terms of second
 /// order, and the weights, of where it came to, rad.
-const RELINEARIZE_ABOVE: f64 = 0.02;
+pub(super) const RELINEARIZE_ABOVE: f64 = 0.02;
 /// In a linear system an update turns the body by a squared Mahalanobis distance of at most that
 /// of the innovations. Beyond so many times that, the concentrated form has found the density's
 /// mode where it does not hold, and wrong matches have led it there.
@@ -35,7 +37,16 @@ const NOISE_TURN: f64 = 16.3;
 const INFLATIONS: [f64; 3] = [1.0, 16.0, 256.0];
 
 /// What a posterior refuses that has no mode.
-const NO_POSTERIOR: FilterError = FilterError::NotPositive("posterior information");
+pub(super) const NO_POSTERIOR: FilterError = FilterError::NotPositive("posterior information");
+
+/// Which points of the state an update has worked on, where the calibration is part of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Points {
+    /// As the camera sees them, mounted as estimated.
+    AsSeen,
+    /// Those of the world.
+    InWorld,
+}
 
 /// What an update would make of the belief.
 struct Conditioned {
@@ -78,7 +89,10 @@ impl SlamFilter {
         let (points, gating) = (latest.points, latest.gating);
         let accepted = match Self::refusal(&latest) {
             Some(refusal) => Err(refusal),
-            None => self.moved(latest.posterior).and_then(|moved| self.replace_state(moved)),
+            None => {
+                let moved = self.moved(latest.posterior, Points::AsSeen);
+                moved.and_then(|moved| self.replace_state(moved))
+            }
         };
         match accepted {
             Ok(frame) => {
@@ -166,6 +180,23 @@ impl SlamFilter {
         Ok(Conditioned { posterior, nis, points, gating, turns_too_far })
     }
 
+    /// Conditions the belief on a measurement of the navigation part in the coordinates of an update,
+    /// so that a common turn of body and window stays as uncertain as it is.
+    pub(super) fn update_linear(
+        &mut self,
+        measurement: &LinearMeasurement<Const<6>, Const<NAVIGATION>>,
+    ) -> Result<FrameChange, FilterError> {
+        let rows = StateRows::of_navigation(measurement)
+            .ok_or(FilterError::NotPositive("measurement covariance"))?
+            .for_update(&self.state, self.error, &self.attitude());
+        let changed = self.changed_coordinates();
+        let covariance = changed.as_ref().unwrap_or(&self.state.covariance);
+        let parts = [(&rows, &self.expansion_of_prior())];
+        let (_, posterior) = self.posterior_by_rows(covariance, &parts)?;
+        let moved = self.moved(posterior, Points::AsSeen)?;
+        self.replace_state(moved)
+    }
+
     /// The covariance in the coordinates in which points condition it, where they are not those of
     /// the state.
     fn changed_coordinates(&self) -> Option<DMatrix<f64>> {
@@ -184,7 +215,11 @@ impl SlamFilter {
     }
 
     /// The state with the means and the covariance of a posterior.
-    fn moved(&self, posterior: Posterior) -> Result<JointState, FilterError> {
+    pub(super) fn moved(
+        &self,
+        posterior: Posterior,
+        points: Points,
+    ) -> Result<JointState, FilterError> {
         let Posterior { means, covariance, expansion } = posterior;
         let not_finite = FilterError::NotFinite("posterior");
         let mean = |start: usize| means.get(start / 3 - 1).copied().ok_or(not_finite);
@@ -224,9 +259,12 @@ impl SlamFilter {
             calibration,
             measured_rate: self.state.measured_rate,
         };
-        self.place_points(&mut moved, &means);
+        self.place_points(&mut moved, &means, points);
         let covariance = moved.with_clone_errors(self.error, covariance, CloneErrors::Stored);
-        moved.covariance = moved.with_camera(covariance, 1.0);
+        moved.covariance = match points {
+            Points::AsSeen => moved.with_camera(covariance, 1.0),
+            Points::InWorld => covariance,
+        };
         moved.renew_belief_covariance();
         Ok(moved)
     }
@@ -242,11 +280,12 @@ impl SlamFilter {
         clones
     }
 
-    /// Points where the camera, as it is mounted now, sees what was found for them.
-    fn place_points(&self, moved: &mut JointState, means: &[Vector3<f64>]) {
+    /// Points where they were found, or where the camera, as it is mounted now, sees what was.
+    fn place_points(&self, moved: &mut JointState, means: &[Vector3<f64>], points: Points) {
         let motion = self.state.motion();
         let base = moved.euclidean_index(Block::Point(0));
-        let (pose, now) = (moved.belief.state.world_from_body, moved.calibration);
+        let pose = moved.belief.state.world_from_body;
+        let now = moved.calibration.filter(|_| points == Points::AsSeen);
         for (point, position) in moved.points.iter_mut().zip(means.iter().skip(base)) {
             point.position = *position;
             if let Some((now, before)) = now.as_ref().zip(self.state.calibration.as_ref()) {

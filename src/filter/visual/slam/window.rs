@@ -117,9 +117,8 @@ impl JointState {
         ];
         if self.calibration.is_some() {
             let motion = self.motion().beyond_noise();
-            let column = |v: Vector3<f64>| {
-                Matrix3::from_columns(&[v, Vector3::zeros(), Vector3::zeros()])
-            };
+            let column =
+                |v: Vector3<f64>| Matrix3::from_columns(&[v, Vector3::zeros(), Vector3::zeros()]);
             let rotation = self.belief.state.world_from_body.rotation;
             let clock = self.row(Block::Calibration(2));
             terms.push((0, clock, column(motion.angular_velocity)));
