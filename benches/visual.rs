@@ -5,10 +5,14 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use mfg_vio::alignment::{PointPair, WeightedPair, align, weighted_kabsch};
-use mfg_vio::filter::{FilterConfig, FilterKind, InertialStep};
+use mfg_vio::filter::{
+    FilterConfig, FilterKind, InertialStep, MapEstimate, MountedCamera, Track, TrackUse, TrackView,
+    VisualInertialFilter,
+};
 use mfg_vio::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator};
+use mfg_vio::sensor::{Camera, PinholeCamera};
 use mfg_vio::so3::exp;
-use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
+use nalgebra::{Isometry3, Matrix2, Matrix3, Point3, UnitQuaternion, Vector2, Vector3};
 
 const POINTS: [usize; 3] = [125, 500, 2000];
 
@@ -122,5 +126,98 @@ fn propagation(c: &mut Criterion) {
     }
 }
 
-criterion_group!(visual, units, updates, map, propagation);
+/// A camera that looks along x.
+fn camera() -> MountedCamera {
+    let intrinsics = PinholeCamera { fx: 450.0, fy: 450.0, cx: 320.0, cy: 240.0 };
+    let axes = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
+    let rotation = UnitQuaternion::from_matrix(&axes);
+    let body_from_camera = Isometry3::from_parts(Vector3::zeros().into(), rotation);
+    MountedCamera { camera: Camera::pinhole(intrinsics), body_from_camera }
+}
+
+/// A filter with a window of poses a decimetre apart and points in its state.
+fn with_window(kind: FilterKind, poses: usize, points: u64) -> Box<dyn VisualInertialFilter> {
+    let propagator = Propagator::inertial(&ImuConfig::default());
+    let mut filter = kind.start(&FilterConfig::default(), propagator, belief());
+    for _ in 0..poses {
+        for _ in 0..6 {
+            let rotation = filter.belief().state.world_from_body.rotation;
+            let step = InertialStep {
+                seconds: 0.03,
+                angular_velocity: Vector3::new(0.1, -0.2, 0.3),
+                specific_force: Some(rotation.inverse() * Vector3::new(0.5, 0.3, 9.80665)),
+                angle_covariance: Matrix3::zeros(),
+            };
+            filter.propagate(&step).unwrap();
+        }
+        filter.pose_window_mut().unwrap().clone_pose(0.0).unwrap();
+    }
+    for id in 0..points {
+        let estimate = MapEstimate { position: place(id), covariance: Matrix3::identity() * 1e-3 };
+        assert!(filter.point_state_mut().unwrap().admit_known(id, &estimate));
+    }
+    filter
+}
+
+/// In front of all poses of the window.
+fn place(id: u64) -> Vector3<f64> {
+    let phase = id as f64;
+    let in_body = Vector3::new(4.0 + phase.sin(), (1.7 * phase).sin(), (2.3 * phase).cos());
+    (world_from_body() * Point3::from(in_body)).coords
+}
+
+/// What the window's last `poses` poses see of a point, a third of a pixel off.
+fn track(filter: &dyn VisualInertialFilter, id: u64, poses: usize) -> Track {
+    let (window, camera) = (filter.pose_window().unwrap(), camera());
+    let clones = window.clones();
+    let last = clones.len() - poses;
+    let views = (last..clones.len()).filter_map(|k| {
+        let clone = &clones[k];
+        let body = window.cloned_pose(*clone)?.world_from_body;
+        let in_body = body.inverse_transform_point(&Point3::from(place(id)));
+        let in_camera = camera.body_from_camera.inverse_transform_point(&in_body).coords;
+        let phase = id as f64 + 1.3 * k as f64;
+        let off = Vector2::new(phase.sin(), (1.7 * phase).cos());
+        Some(TrackView {
+            clone: *clone,
+            camera: 0,
+            pixel: camera.camera.project(&in_camera)? + off * 0.3,
+            pixel_covariance: Matrix2::identity() * 0.1,
+            depth: None,
+        })
+    });
+    Track { id, views: views.collect(), purpose: TrackUse::Eliminate }
+}
+
+/// One update by tracks that have just ended and by the points of the state that are seen, as of a
+/// frame of a running filter.
+fn tracks(c: &mut Criterion) {
+    let cameras = [camera()];
+    for kind in [FilterKind::Mfgs, FilterKind::Iekfs, FilterKind::Mekfs] {
+        for (poses, points, ended) in [(11, 0, 8), (11, 25, 6), (11, 50, 4), (20, 50, 4)] {
+            let setup = || {
+                let filter = with_window(kind, poses, points);
+                let held = (0..points).map(|id| track(filter.as_ref(), id, 1));
+                let ended = (100..100 + ended).map(|id| track(filter.as_ref(), id, 11));
+                let tracks: Vec<_> = held.chain(ended).collect();
+                (filter, tracks)
+            };
+            let name = format!("tracks/{kind}/{poses} poses, {points} points, {ended} ended");
+            c.bench_function(&name, |b| {
+                b.iter_batched(
+                    setup,
+                    |(mut filter, tracks)| {
+                        let window = filter.pose_window_mut().unwrap();
+                        let update = window.update_tracks(&tracks, &cameras).unwrap();
+                        assert!(update.rows > 100, "{update:?}");
+                        filter
+                    },
+                    criterion::BatchSize::LargeInput,
+                );
+            });
+        }
+    }
+}
+
+criterion_group!(visual, units, updates, map, propagation, tracks);
 criterion_main!(visual);

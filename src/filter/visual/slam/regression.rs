@@ -214,36 +214,49 @@ impl<'a> Regression<'a> {
     /// counted from the prediction: `0 = H (u - u_i) + H_e (e - e_i) - residual + noise`. Gives the
     /// squared Mahalanobis distance of all innovations so far.
     pub fn condition_rows(&mut self, rows: &UpdateRows, expansion: &Expansion) -> Option<f64> {
+        let turned = so3::log(&(self.prior.inverse() * expansion.mode));
+        let mut moved = DVector::zeros(rows.jacobian.ncols());
+        for (k, block) in rows.blocks.iter().enumerate() {
+            moved.fixed_rows_mut::<3>(3 * k).copy_from(&expansion.moved[*block]);
+        }
+        let expected = &rows.residual + &rows.jacobian * moved + &rows.by_rotation * turned;
         let count = rows.residual.len();
         for first in (0..count).step_by(BATCH_ROWS) {
-            let len = BATCH_ROWS.min(count - first);
-            let h = rows.jacobian.rows(first, len);
-            let by_rotation = rows.by_rotation.rows(first, len);
-            let n = self.covariance.ncols();
-            let mut columns = DMatrix::zeros(n, h.ncols());
-            let mut slope = DMatrix::zeros(h.ncols(), self.error.size());
-            let mut moved = DVector::zeros(h.ncols());
-            for (k, block) in rows.blocks.iter().enumerate() {
-                columns.fixed_columns_mut::<3>(3 * k).copy_from(&self.columns(*block));
-                slope.rows_mut(3 * k, 3).copy_from(&self.slope.rows(3 * block, 3));
-                moved.fixed_rows_mut::<3>(3 * k).copy_from(&expansion.moved[*block]);
-            }
-            let mut cross = DMatrix::zeros(n, len);
-            cross.gemm(1.0, &columns, &h.transpose(), 0.0);
-            let mut innovation = DMatrix::identity(len, len);
-            for (k, block) in rows.blocks.iter().enumerate() {
-                let by_block = h.columns(3 * k, 3);
-                innovation.gemm(1.0, &by_block, &cross.rows(3 * block, 3), 1.0);
-            }
-            let turned = so3::log(&(self.prior.inverse() * expansion.mode));
-            let mut design = h * slope;
-            let mut by_coordinate = design.columns_mut(0, self.error.size() - 1);
-            by_coordinate += by_rotation * self.coordinate_by_y();
-            let mut constant = design.column_mut(self.error.size() - 1);
-            constant -= rows.residual.rows(first, len) + h * moved + by_rotation * turned;
-            self.absorb(cross, innovation, design)?;
+            self.condition_row_batch(rows, &expected, first, BATCH_ROWS.min(count - first))?;
         }
         self.squared_innovation()
+    }
+
+    /// The same for some of the rows, of which the residuals are counted from the prediction.
+    fn condition_row_batch(
+        &mut self,
+        rows: &UpdateRows,
+        residual: &DVector<f64>,
+        first: usize,
+        len: usize,
+    ) -> Option<()> {
+        let h = rows.jacobian.rows(first, len);
+        let by_rotation = rows.by_rotation.rows(first, len);
+        let n = self.covariance.ncols();
+        let mut columns = DMatrix::zeros(n, h.ncols());
+        let mut slope = DMatrix::zeros(h.ncols(), self.error.size());
+        for (k, block) in rows.blocks.iter().enumerate() {
+            columns.fixed_columns_mut::<3>(3 * k).copy_from(&self.columns(*block));
+            slope.rows_mut(3 * k, 3).copy_from(&self.slope.rows(3 * block, 3));
+        }
+        let cross = columns * h.transpose();
+        let mut of_blocks = DMatrix::zeros(h.ncols(), len);
+        for (k, block) in rows.blocks.iter().enumerate() {
+            of_blocks.rows_mut(3 * k, 3).copy_from(&cross.rows(3 * block, 3));
+        }
+        let mut innovation = h * of_blocks;
+        (0..len).for_each(|k| innovation[(k, k)] += 1.0);
+        let mut design = h * slope;
+        let mut by_coordinate = design.columns_mut(0, self.error.size() - 1);
+        by_coordinate += by_rotation * self.coordinate_by_y();
+        let mut constant = design.column_mut(self.error.size() - 1);
+        constant -= residual.rows(first, len);
+        self.absorb(cross, innovation, design)
     }
 
     /// Derivative by `y`, without its last entry, of the rotation error that the regression is on.

@@ -65,11 +65,6 @@ fn attitude(t: f64) -> UnitQuaternion<f64> {
     UnitQuaternion::from_euler_angles(0.2 * (1.1 * t).sin(), 0.25 * (0.8 * t).sin(), 0.4 * t)
 }
 
-fn rate(t: f64) -> Vector3<f64> {
-    let h = 1e-4;
-    (attitude(t - h).inverse() * attitude(t + h)).scaled_axis() / (2.0 * h)
-}
-
 fn pose(t: f64) -> Isometry3<f64> {
     Isometry3::from_parts(place(t).into(), attitude(t))
 }

@@ -404,7 +404,7 @@ proptest! {
         let rest = ZeroVelocity { rate: vector(&mut rng, 0.1), velocity_sd: 0.1, rate_sd: 0.01 };
         for (turn, shift) in [(Vector3::z(), Vector3::zeros()), (Vector3::zeros(), vector(&mut rng, 1.0))] {
             let mut filter = filter.clone();
-            let mut known = |filter: &SlamFilter| {
+            let known = |filter: &SlamFilter| {
                 information(&covariance(filter), &gauge(&filter.state, &turn, &shift))
             };
             let before = known(&filter);
