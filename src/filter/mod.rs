@@ -18,7 +18,8 @@ pub use visual::{
     AttitudeDensity, BodyPoints, Calibration, Candidate, CloneId, ClonedPose, ErrorState,
     FilterConfig, FilterKind, FrameChange, Gating, KnownAttitude, MapRefinement, MapTreatment,
     Mekf, MfgFilter, MountedCamera, PointObservation, PointState, PointUpdate, PoseSpread,
-    PoseWindow, SlamFilter, Track, TrackDepth, TrackOutcome, TrackUpdate, TrackUse, TrackView,
-    UpdateMethod, VisualInertialFilter, ZeroVelocity, calibration_block, choose_points,
-    point_by_pose,
+    PoseWindow, SlamFilter, StartInput, StartPrior, StartSolution, StartTrack, StartView,
+    StartedFilter, Track, TrackDepth, TrackOutcome, TrackUpdate, TrackUse, TrackView, UpdateMethod,
+    VisualInertialFilter, ZeroVelocity, calibration_block, choose_points, point_by_pose,
+    start_block, start_without_depth,
 };

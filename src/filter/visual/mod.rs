@@ -4,6 +4,7 @@ mod body_points;
 mod broad;
 mod calibration;
 mod config;
+mod depthless_start;
 mod estimator;
 mod euclidean;
 mod gate;
@@ -21,6 +22,9 @@ mod zero_velocity;
 pub use body_points::BodyPoints;
 pub use calibration::{Calibration, calibration_block};
 pub use config::{FilterConfig, MapTreatment, UpdateMethod};
+pub use depthless_start::{
+    StartInput, StartPrior, StartSolution, StartTrack, StartView, start_block, start_without_depth,
+};
 pub use estimator::{
     FrameChange, Gating, PointObservation, PointState, PointUpdate, PoseSpread,
     VisualInertialFilter,
@@ -31,8 +35,8 @@ pub use mekf::Mekf;
 pub use mfg::MfgFilter;
 pub use selection::{Candidate, choose_points};
 pub use slam::{
-    AttitudeDensity, CloneId, ClonedPose, ErrorState, MountedCamera, PoseWindow, SlamFilter, Track,
-    TrackDepth, TrackOutcome, TrackUpdate, TrackUse, TrackView,
+    AttitudeDensity, CloneId, ClonedPose, ErrorState, MountedCamera, PoseWindow, SlamFilter,
+    StartedFilter, Track, TrackDepth, TrackOutcome, TrackUpdate, TrackUse, TrackView,
 };
 pub use start::KnownAttitude;
 pub use zero_velocity::ZeroVelocity;

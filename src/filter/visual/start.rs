@@ -3,13 +3,15 @@
 use nalgebra::Matrix3;
 
 use super::config::{FilterConfig, MapTreatment};
+use super::depthless_start::{StartInput, StartSolution};
 use super::estimator::VisualInertialFilter;
 use super::handover::HandOver;
 use super::kind::FilterKind;
 use super::mekf::Mekf;
 use super::mfg::MfgFilter;
-use super::slam::{AttitudeDensity, ErrorState, SlamFilter, UNIFORM_VARIANCE};
+use super::slam::{AttitudeDensity, ErrorState, SlamFilter, StartedFilter, UNIFORM_VARIANCE};
 use crate::distribution::matrix_fisher::MatrixFisher;
+use crate::filter::core::FilterError;
 use crate::inertial::{Belief, Propagator, block};
 
 /// What is known of the attitude at the start.
@@ -43,12 +45,36 @@ impl FilterKind {
 
     /// A filter whose state holds map points.
     fn joint(self, config: &FilterConfig, propagator: Propagator, belief: Belief) -> SlamFilter {
-        let error = match self {
+        SlamFilter::new(self, config, self.error_state(), propagator, belief)
+    }
+
+    /// The coordinates of errors of a filter whose state holds map points.
+    fn error_state(self) -> ErrorState {
+        match self {
             Self::Mekfs => ErrorState::So3xRn,
             Self::Iekfs => ErrorState::RightInvariant { density: AttitudeDensity::Gaussian },
             _ => ErrorState::RightInvariant { density: AttitudeDensity::MatrixFisher },
-        };
-        SlamFilter::new(self, config, error, propagator, belief)
+        }
+    }
+
+    /// A filter that starts without depth, from what was found of its motion, with a window of the
+    /// poses of the frames `kept`.
+    ///
+    /// # Errors
+    /// [`FilterError::Unsupported`] for filters whose state holds no points, and those of
+    /// [`SlamFilter::from_motion`].
+    pub fn start_from_motion(
+        self,
+        config: &FilterConfig,
+        propagator: Propagator,
+        input: &StartInput<'_>,
+        found: &StartSolution,
+        kept: &[usize],
+    ) -> Result<StartedFilter, FilterError> {
+        if self.map_treatment() != MapTreatment::Correlated {
+            return Err(FilterError::Unsupported { filter: self.name(), measurement: "track" });
+        }
+        SlamFilter::from_motion(self, self.error_state(), config, propagator, input, found, kept)
     }
 
     /// The same where the attitude is too uncertain for a covariance: the MFG filters start from

@@ -1,5 +1,6 @@
 //! Filters that keep map points in the state, with all correlations (`mfgs`, `iekfs`, `mekfs`).
 
+mod from_motion;
 mod gravity;
 mod levelling;
 mod regression;
@@ -40,6 +41,7 @@ use state::{Block, JointState, StatePoint};
 /// Variance of each component of the rotation vector of a uniform rotation, rad^2:
 /// `(pi^2 / 3 + 2) / 3`.
 pub(super) const UNIFORM_VARIANCE: f64 = 1.763_289_378_698_817_6;
+pub use from_motion::StartedFilter;
 pub use regression::{AttitudeDensity, ErrorState};
 pub use track::{
     CloneId, ClonedPose, MountedCamera, PoseWindow, Track, TrackDepth, TrackOutcome, TrackUpdate,

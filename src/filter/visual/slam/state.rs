@@ -240,7 +240,7 @@ impl JointState {
         let points = self.row(Block::Point(0));
         let turns = |row: &usize| {
             let of_pose = (clones..points).contains(row);
-            !calibration.contains(row) && !(of_pose && (row - clones).is_multiple_of(CLONE))
+            !(calibration.contains(row) || of_pose && (row - clones).is_multiple_of(CLONE))
         };
         let world_blocks = [block::VELOCITY, block::POSITION]
             .into_iter()

@@ -186,9 +186,16 @@ impl SlamFilter {
         &mut self,
         measurement: &LinearMeasurement<Const<6>, Const<NAVIGATION>>,
     ) -> Result<FrameChange, FilterError> {
-        let rows = StateRows::of_navigation(measurement)
-            .ok_or(FilterError::NotPositive("measurement covariance"))?
-            .for_update(&self.state, self.error, &self.attitude());
+        let rows = StateRows::of_navigation(measurement);
+        self.update_rows_as_seen(rows.ok_or(FilterError::NotPositive("measurement covariance"))?)
+    }
+
+    /// The same with rows that depend on no point of the state.
+    pub(super) fn update_rows_as_seen(
+        &mut self,
+        rows: StateRows,
+    ) -> Result<FrameChange, FilterError> {
+        let rows = rows.for_update(&self.state, self.error, &self.attitude());
         let changed = self.changed_coordinates();
         let covariance = changed.as_ref().unwrap_or(&self.state.covariance);
         let parts = [(&rows, &self.expansion_of_prior())];
