@@ -1,10 +1,11 @@
 //! What all visual-inertial filters share: the trait, what it takes and what it returns.
 
-use nalgebra::{Isometry3, Matrix3, Matrix6, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Matrix6, Vector3};
 
 use super::body_points::BodyPoints;
 use super::calibration::Calibration;
 use super::config::MapTreatment;
+use super::frame_change::FrameChange;
 use super::map_points::{self, MapRefinement};
 use super::slam::PoseWindow;
 use super::zero_velocity::ZeroVelocity;
@@ -199,17 +200,6 @@ pub struct Gating {
     pub threshold: f64,
     /// Points left out.
     pub rejected: usize,
-}
-
-/// How an update changed what is kept in world coordinates outside of the filter: first the world
-/// turns, then the map follows the camera.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct FrameChange {
-    /// Turn of the world about its origin, where gravity was levelled.
-    pub world_turn: Option<UnitQuaternion<f64>>,
-    /// What the camera's estimated mounting has moved by, in body coordinates: points that were
-    /// placed by it from about here move with it.
-    pub camera_moved: Option<Isometry3<f64>>,
 }
 
 /// Standard deviations of each component of pose and velocity.

@@ -3,7 +3,8 @@
 use nalgebra::{Const, Matrix6, Rotation3, SMatrix, Vector3, Vector6};
 
 use super::config::FilterConfig;
-use super::estimator::{FrameChange, PointUpdate, VisualInertialFilter};
+use super::estimator::{PointUpdate, VisualInertialFilter};
+use super::frame_change::FrameChange;
 use super::gate::Gate;
 use super::kind::FilterKind;
 use super::map_points::normalized_innovation_squared;

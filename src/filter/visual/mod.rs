@@ -7,6 +7,7 @@ mod config;
 mod depthless_start;
 mod estimator;
 mod euclidean;
+mod frame_change;
 mod gate;
 mod handover;
 mod kind;
@@ -26,9 +27,9 @@ pub use depthless_start::{
     StartInput, StartPrior, StartSolution, StartTrack, StartView, start_block, start_without_depth,
 };
 pub use estimator::{
-    FrameChange, Gating, PointObservation, PointState, PointUpdate, PoseSpread,
-    VisualInertialFilter,
+    Gating, PointObservation, PointState, PointUpdate, PoseSpread, VisualInertialFilter,
 };
+pub use frame_change::FrameChange;
 pub use kind::FilterKind;
 pub use map_points::{MapRefinement, point_by_pose};
 pub use mekf::Mekf;

@@ -6,8 +6,8 @@
 use nalgebra::{DMatrix, Matrix3, UnitQuaternion, Vector3};
 
 use super::gravity::UnknownGravity;
+use super::pose_clone::CLONE;
 use super::state::{Block, JointState, NAVIGATION};
-use super::window::CLONE;
 use crate::filter::core::FilterError;
 use crate::filter::linear::LinearMeasurement;
 use crate::inertial::block;

@@ -1,8 +1,10 @@
 //! Filters that keep map points in the state, with all correlations (`mfgs`, `iekfs`, `mekfs`).
 
+mod error_state;
 mod from_motion;
 mod gravity;
 mod levelling;
+mod pose_clone;
 mod regression;
 mod rows;
 mod state;
@@ -23,8 +25,9 @@ use nalgebra::{Dyn, Isometry3, Matrix3, OMatrix, Rotation3, U3, Vector3};
 use super::calibration::Calibration;
 use super::config::FilterConfig;
 use super::estimator::{
-    FrameChange, PointObservation, PointState, PointUpdate, PoseSpread, VisualInertialFilter,
+    PointObservation, PointState, PointUpdate, PoseSpread, VisualInertialFilter,
 };
+use super::frame_change::FrameChange;
 use super::gate::Gate;
 use super::kind::FilterKind;
 use super::map_points::point_by_pose;
@@ -41,8 +44,8 @@ use state::{Block, JointState, StatePoint};
 /// Variance of each component of the rotation vector of a uniform rotation, rad^2:
 /// `(pi^2 / 3 + 2) / 3`.
 pub(super) const UNIFORM_VARIANCE: f64 = 1.763_289_378_698_817_6;
+pub use error_state::{AttitudeDensity, ErrorState};
 pub use from_motion::StartedFilter;
-pub use regression::{AttitudeDensity, ErrorState};
 pub use track::{
     CloneId, ClonedPose, MountedCamera, PoseWindow, Track, TrackDepth, TrackOutcome, TrackUpdate,
     TrackUse, TrackView,

@@ -6,10 +6,10 @@ use std::collections::BTreeSet;
 use nalgebra::{Const, DMatrix, DVector, Dyn, Matrix3, OMatrix, Rotation3, U3, Vector3};
 use statrs::distribution::{ChiSquared, ContinuousCDF};
 
-use super::regression::ErrorState;
+use super::error_state::ErrorState;
+use super::pose_clone::{CLONE, CloneErrors, clone_errors};
 use super::state::{Block, JointState, NAVIGATION, StatePoint};
 use super::triangulation::TrackRows;
-use super::window::{CLONE, CloneErrors, clone_errors};
 use crate::filter::linear::LinearMeasurement;
 use crate::inertial::block;
 

@@ -9,9 +9,9 @@ use nalgebra::{
     DMatrix, DVector, Dyn, Isometry3, Matrix3, OMatrix, Point3, U3, UnitQuaternion, Vector3,
 };
 
+use super::error_state::{BIASES, ErrorState};
 use super::gravity::UnknownGravity;
-use super::regression::{BIASES, ErrorState};
-use super::window::{CLONE, PoseClone};
+use super::pose_clone::{CLONE, PoseClone};
 use crate::filter::visual::calibration::{BodyMotion, CALIBRATION_BLOCKS, Calibration};
 use crate::filter::visual::estimator::PoseSpread;
 use crate::inertial::{Belief, NavCovariance, block};

@@ -4,7 +4,7 @@ use nalgebra::{Isometry3, Matrix2, Matrix6, Point2, Vector3};
 
 use crate::alignment::MapEstimate;
 use crate::filter::core::FilterError;
-use crate::filter::visual::estimator::FrameChange;
+use crate::filter::visual::frame_change::FrameChange;
 use crate::sensor::Camera;
 
 /// A pose of the window. Never given twice by one filter.

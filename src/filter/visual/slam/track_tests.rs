@@ -1,7 +1,7 @@
 //! Laws of the window and of the update by tracks.
 
+use super::pose_clone::CLONE;
 use super::triangulation::PlacedTrack;
-use super::window::CLONE;
 use super::*;
 use crate::filter::FilterKind;
 use crate::inertial::{ImuConfig, NavState};

@@ -6,6 +6,7 @@
 use nalgebra::{DMatrix, Vector3};
 
 use super::SlamFilter;
+use super::pose_clone::CloneErrors;
 use super::regression::{Expansion, Posterior, Regression};
 use super::rows::{Eliminated, StateRows, UpdateRows};
 use super::state::{Block, JointState};
@@ -15,10 +16,10 @@ use super::track::{
 };
 use super::triangulation::{PlacedTrack, Triangulated};
 use super::update::{NO_POSTERIOR, Points, RELINEARIZE_ABOVE};
-use super::window::CloneErrors;
 use crate::alignment::MapEstimate;
 use crate::filter::core::{BayesFilter, FilterError};
-use crate::filter::visual::estimator::{FrameChange, PointState};
+use crate::filter::visual::estimator::PointState;
+use crate::filter::visual::frame_change::FrameChange;
 
 /// A point whose range is known worse than this, relative to it, does not enter the state: there its
 /// error is Gaussian along the ray, which that of an inverse range is not.

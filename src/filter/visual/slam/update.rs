@@ -10,13 +10,14 @@ use nalgebra::{Const, DMatrix, Point3, UnitQuaternion, Vector3};
 
 use super::SlamFilter;
 use super::gravity::UnknownGravity;
+use super::pose_clone::{CLONE, CloneErrors, PoseClone};
 use super::regression::{Expansion, Measurement, Posterior, Regression};
 use super::rows::StateRows;
 use super::state::{Block, JointState, NAVIGATION};
-use super::window::{CLONE, CloneErrors, PoseClone};
 use crate::filter::core::{BayesFilter, FilterError};
 use crate::filter::linear::LinearMeasurement;
-use crate::filter::visual::estimator::{FrameChange, Gating, PointUpdate, contradicts};
+use crate::filter::visual::estimator::{Gating, PointUpdate, contradicts};
+use crate::filter::visual::frame_change::FrameChange;
 use crate::inertial::block;
 use crate::so3;
 
