@@ -184,6 +184,7 @@ impl BayesFilter for SlamFilter {
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         let transition = advance(&self.propagator, &mut self.state.belief, step)?;
         self.state.measured_rate = step.angular_velocity;
+        self.state.is_cloned = false;
         self.timed_by = self.state.calibration;
         self.carried += step.seconds;
         self.state.transition = transition * self.state.transition;

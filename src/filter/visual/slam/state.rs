@@ -49,6 +49,8 @@ pub(super) struct JointState {
     pub clones: Vec<PoseClone>,
     /// How many poses have been cloned so far.
     pub clones_taken: u64,
+    /// Whether the last of them is a copy of the present pose.
+    pub is_cloned: bool,
     /// In the order of their rows.
     pub points: Vec<StatePoint>,
     /// Its navigation rows and columns date from the last update; [`Self::synchronize`] brings them
@@ -70,6 +72,7 @@ impl JointState {
             belief,
             clones: Vec::new(),
             clones_taken: 0,
+            is_cloned: false,
             points: Vec::with_capacity(points),
             covariance: DMatrix::from_fn(NAVIGATION, NAVIGATION, |i, j| belief.covariance[(i, j)]),
             transition: NavCovariance::identity(),

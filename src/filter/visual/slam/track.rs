@@ -85,8 +85,15 @@ pub enum TrackOutcome {
     Refused(FilterError),
 }
 
+impl TrackOutcome {
+    /// Whether the track's residual was improbable.
+    pub fn is_improbable(&self) -> bool {
+        matches!(self, Self::Refused(FilterError::ImprobableTrack { .. }))
+    }
+}
+
 /// What an update by tracks did, besides changing the belief.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct TrackUpdate {
     /// One for each track offered, in their order.
     pub outcomes: Vec<TrackOutcome>,
@@ -95,16 +102,16 @@ pub struct TrackUpdate {
     /// Normalised innovation squared (NIS) per row that entered; about 1 when consistent, 0
     /// without rows.
     pub nis: f64,
+    /// Whether most of the tracks that the present pose sees contradicted the prediction: its
+    /// covariance was inflated by what an IMU may do wrong, unless even that did not help.
+    pub contradicted: bool,
     pub frame: FrameChange,
 }
 
 impl TrackUpdate {
     /// How many tracks were left out because their residual was improbable.
     pub fn improbable(&self) -> usize {
-        let improbable = |outcome: &&TrackOutcome| {
-            matches!(outcome, TrackOutcome::Refused(FilterError::ImprobableTrack { .. }))
-        };
-        self.outcomes.iter().filter(improbable).count()
+        self.outcomes.iter().filter(|outcome| outcome.is_improbable()).count()
     }
 }
 

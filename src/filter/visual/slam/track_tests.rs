@@ -671,3 +671,34 @@ fn depths_that_err_alike_are_worth_one() {
         assert!((variance / expected - 1.0).abs() < 1e-3, "{variance} {expected}");
     }
 }
+
+/// A gyroscope that read wrongly since the last frame: the tracks that the present pose sees show it,
+/// and the pose is found again. A few wrong tracks are just refused.
+#[test]
+fn a_prediction_that_most_tracks_contradict_was_the_imus_fault() {
+    for kind in KINDS {
+        let mut rng = ChaCha8Rng::seed_from_u64(21);
+        let mut filter = with_window(kind, 21, 6, 0.01);
+        filter.track_gate = TrackGate::new(1e-3);
+        propagate(&mut filter, 0.05, &Vector3::zeros(), &Vector3::zeros());
+        assert!(filter.clone_pose(0.0).is_ok());
+        let truth = filter.belief().state.world_from_body;
+        let tracks: Vec<_> = (0..20)
+            .map(|id| {
+                let point = point_in_front(&filter, &mut rng, 3.0);
+                track(&filter, id, &point, 0.3, false, &mut rng)
+            })
+            .collect();
+        // The same with the present pose turned by three degrees.
+        let off = UnitQuaternion::new(Vector3::new(0.03, -0.04, 0.02));
+        filter.state.belief.state.world_from_body.rotation *= off;
+        filter.state.clones[6].world_from_body.rotation *= off;
+        filter.state.synchronize();
+        let few = filter.clone().update_tracks(&tracks[..4], &cameras()).unwrap();
+        assert!(!few.contradicted && few.improbable() == 4, "{kind}: {few:?}");
+        let update = filter.update_tracks(&tracks, &cameras()).unwrap();
+        assert!(update.contradicted && update.rows > 100, "{kind}: {update:?}");
+        let turned = angle(&filter.belief().state.world_from_body.rotation, &truth.rotation);
+        assert!(turned < 0.01, "{kind}: {turned}");
+    }
+}

@@ -15,11 +15,10 @@ use super::track::{
     TrackView,
 };
 use super::triangulation::{PlacedTrack, Triangulated};
-use super::update::{NO_POSTERIOR, Points, RELINEARIZE_ABOVE};
+use super::update::{FEW_POINTS, INFLATIONS, NO_POSTERIOR, Points, RELINEARIZE_ABOVE};
 use crate::alignment::MapEstimate;
 use crate::filter::core::{BayesFilter, FilterError};
 use crate::filter::visual::estimator::PointState;
-use crate::filter::visual::frame_change::FrameChange;
 
 /// A point whose range is known worse than this, relative to it, does not enter the state: there its
 /// error is Gaussian along the ray, which that of an inverse range is not.
@@ -44,6 +43,14 @@ enum Kind {
     Admitted,
     /// It was part of the state.
     Held,
+}
+
+/// What came of looking at all tracks.
+struct Judged<'a> {
+    outcomes: Vec<TrackOutcome>,
+    accepted: Vec<Accepted<'a>>,
+    /// Whether the prediction was contradicted, and has been inflated.
+    contradicted: bool,
 }
 
 /// What an update makes of the belief.
@@ -117,6 +124,52 @@ fn held(
 }
 
 impl SlamFilter {
+    /// Looks at all tracks. If most of those that are seen from the present pose are improbable, it is
+    /// the IMU that was wrong since the last update: its pose is made less certain, as much as it
+    /// takes. Where nothing helps, the tracks stay refused.
+    fn judged_until_sound<'a>(
+        &mut self,
+        tracks: &'a [Track],
+        cameras: &[MountedCamera],
+    ) -> Judged<'a> {
+        let certain = self.state.clone();
+        let first = self.judged(tracks, cameras);
+        let inflation = self.propagator.inflation(self.carried);
+        let (Some(inflation), true) = (inflation, self.contradicts(tracks, &first.outcomes)) else {
+            return first;
+        };
+        for factor in INFLATIONS {
+            self.state = certain.clone();
+            self.state.inflate_present(&(inflation * factor));
+            let judged = self.judged(tracks, cameras);
+            if !self.contradicts(tracks, &judged.outcomes) {
+                return Judged { contradicted: true, ..judged };
+            }
+        }
+        self.state = certain;
+        Judged { contradicted: true, ..self.judged(tracks, cameras) }
+    }
+
+    fn judged<'a>(&mut self, tracks: &'a [Track], cameras: &[MountedCamera]) -> Judged<'a> {
+        let mut accepted = Vec::new();
+        let outcomes =
+            tracks.iter().map(|track| self.consider(track, cameras, &mut accepted)).collect();
+        Judged { outcomes, accepted, contradicted: false }
+    }
+
+    /// Whether all but a quarter of the tracks that the present pose sees are improbable, and they
+    /// are not so few that they may all be mismatched.
+    fn contradicts(&self, tracks: &[Track], outcomes: &[TrackOutcome]) -> bool {
+        let Some(present) = self.state.present_clone() else { return false };
+        let sees = |track: &Track| track.views.iter().any(|view| view.clone == present);
+        let (mut seen, mut improbable) = (0, 0);
+        for (_, outcome) in tracks.iter().zip(outcomes).filter(|(track, _)| sees(track)) {
+            seen += usize::from(*outcome != TrackOutcome::Deferred);
+            improbable += usize::from(outcome.is_improbable());
+        }
+        seen >= FEW_POINTS && 4 * improbable > 3 * seen
+    }
+
     /// Looks at a track as long as there is room for its rows, and takes it into what is accepted.
     fn consider<'a>(
         &mut self,
@@ -130,7 +183,7 @@ impl SlamFilter {
             let twice = FilterError::RowUsedTwice { track: track.id, clone: clone.0 };
             return TrackOutcome::Refused(twice);
         }
-        match self.judged(track, cameras, room, used > 0) {
+        match self.judge(track, cameras, room, used > 0) {
             Ok(Some(entering)) => {
                 let outcome = entering.outcome();
                 accepted.push(entering);
@@ -143,7 +196,7 @@ impl SlamFilter {
 
     /// A track that passes its gate, its point admitted if it is to be; `None` where there is no room
     /// for its rows and it `may_wait`.
-    fn judged<'a>(
+    fn judge<'a>(
         &mut self,
         track: &'a Track,
         cameras: &[MountedCamera],
@@ -295,7 +348,8 @@ impl SlamFilter {
             .fold(0.0, f64::max)
     }
 
-    /// Notes that the rows of accepted tracks have been used.
+    /// Notes that the rows of accepted tracks have been used, and that the present pose is corrected if
+    /// it has rows among them.
     fn mark_used(&mut self, accepted: &[Accepted<'_>]) {
         for Accepted { track, .. } in accepted {
             for view in &track.views {
@@ -303,6 +357,11 @@ impl SlamFilter {
                     self.state.clones[slot].mark_used(track.id, view.camera);
                 }
             }
+        }
+        let present = self.state.present_clone();
+        let mut views = accepted.iter().flat_map(|accepted| &accepted.track.views);
+        if views.any(|view| Some(view.clone) == present) {
+            self.carried = 0.0;
         }
     }
 }
@@ -343,19 +402,20 @@ impl PoseWindow for SlamFilter {
     ) -> Result<TrackUpdate, FilterError> {
         self.state.synchronize();
         let before = self.state.clone();
-        let mut accepted = Vec::new();
-        let outcomes =
-            tracks.iter().map(|track| self.consider(track, cameras, &mut accepted)).collect();
-        if accepted.is_empty() {
-            return Ok(TrackUpdate { outcomes, rows: 0, nis: 0.0, frame: FrameChange::default() });
+        let judged = self.judged_until_sound(tracks, cameras);
+        if judged.accepted.is_empty() {
+            self.state = before;
+            return Ok(TrackUpdate { outcomes: judged.outcomes, ..TrackUpdate::default() });
         }
-        let moved = self.moved_by_tracks(&accepted, cameras);
+        let moved = self.moved_by_tracks(&judged.accepted, cameras);
         let conditioned = moved.and_then(|moved| {
             let frame = self.replace_state(moved.state)?;
-            Ok(TrackUpdate { outcomes, rows: moved.rows, nis: moved.nis, frame })
+            let Judged { outcomes, contradicted, .. } = &judged;
+            let (outcomes, contradicted) = (outcomes.clone(), *contradicted);
+            Ok(TrackUpdate { outcomes, rows: moved.rows, nis: moved.nis, contradicted, frame })
         });
         match &conditioned {
-            Ok(_) => self.mark_used(&accepted),
+            Ok(_) => self.mark_used(&judged.accepted),
             Err(_) => self.state = before,
         }
         conditioned

@@ -22,7 +22,7 @@ use crate::inertial::block;
 use crate::so3;
 
 /// Fewer points than this may all be mismatched.
-const FEW_POINTS: usize = 8;
+pub(super) const FEW_POINTS: usize = 8;
 /// An attitude that moved further than this in an update is found anew with the terms of second
 /// order, and the weights, of where it came to, rad.
 pub(super) const RELINEARIZE_ABOVE: f64 = 0.02;
@@ -35,7 +35,7 @@ const MOST_TURN: f64 = 4.0;
 const NOISE_TURN: f64 = 16.3;
 /// Factors on the covariance that the IMU's fault is given, one after the other, until the points
 /// are no longer contradicted.
-const INFLATIONS: [f64; 3] = [1.0, 16.0, 256.0];
+pub(super) const INFLATIONS: [f64; 3] = [1.0, 16.0, 256.0];
 
 /// What a posterior refuses that has no mode.
 pub(super) const NO_POSTERIOR: FilterError = FilterError::NotPositive("posterior information");
@@ -260,6 +260,7 @@ impl SlamFilter {
             belief,
             clones: self.moved_clones(&means),
             clones_taken: self.state.clones_taken,
+            is_cloned: self.state.is_cloned,
             points: self.state.points.clone(),
             covariance: DMatrix::zeros(0, 0),
             transition: self.state.transition,

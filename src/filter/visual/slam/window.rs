@@ -8,9 +8,9 @@ use nalgebra::{DMatrix, DMatrixView, Isometry3, Matrix3, Matrix6, UnitQuaternion
 
 use super::error_state::ErrorState;
 use super::pose_clone::{CLONE, CloneErrors, PoseClone, clone_errors};
-use super::state::{Block, JointState};
+use super::state::{Block, JointState, NAVIGATION};
 use super::track::{CloneId, ClonedPose};
-use crate::inertial::block;
+use crate::inertial::{NavCovariance, block};
 use crate::so3;
 
 /// Derivative of three rows of a new pose's error by three of the state: the row of the former
@@ -49,9 +49,33 @@ impl JointState {
         }
         let id = CloneId(self.clones_taken);
         self.clones_taken += 1;
+        self.is_cloned = true;
         let world_from_body = Isometry3::from_parts(position.into(), rotation);
         self.insert_clone(PoseClone::new(id, world_from_body), &rows, &own);
         Some(id)
+    }
+
+    /// The pose of the window that is a copy of the present one.
+    pub fn present_clone(&self) -> Option<CloneId> {
+        self.clones.last().filter(|_| self.is_cloned).map(|clone| clone.id)
+    }
+
+    /// Adds a covariance to that of the body, and as much to its copy in the window; the covariance is
+    /// up to date.
+    pub fn inflate_present(&mut self, by: &NavCovariance) {
+        let last = self.clones.len().saturating_sub(1);
+        let copies = self.present_clone().map(|_| self.row(Block::Clone(last)));
+        let copies =
+            copies.into_iter().flat_map(|row| [(row, block::ROTATION), (row + 3, block::POSITION)]);
+        let rows: Vec<(usize, usize)> =
+            (0..NAVIGATION).step_by(3).map(|row| (row, row)).chain(copies).collect();
+        for (to_row, row) in &rows {
+            for (to_column, column) in &rows {
+                let mut part = self.covariance.fixed_view_mut::<3, 3>(*to_row, *to_column);
+                part += by.fixed_view::<3, 3>(*row, *column);
+            }
+        }
+        self.renew_belief_covariance();
     }
 
     /// The error of a pose `R_k = R exp(w h)`, `p_k = p + v h`:
