@@ -10,6 +10,7 @@ mod euclidean;
 mod frame_change;
 mod gate;
 mod handover;
+mod inverse_range;
 mod kind;
 mod map_points;
 mod mekf;

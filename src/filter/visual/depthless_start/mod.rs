@@ -424,7 +424,7 @@ fn scale_sd(found: &Iterate, covariance: &SMatrix<f64, 12, 12>) -> Option<f64> {
     let mut mean = SMatrix::<f64, 1, 12>::zeros();
     for ((own, cross, _), chart) in found.normal.points.iter().zip(&found.charts) {
         let by_sought = damped(own, 0.0).cholesky()?.solve(cross) * -chart.inverse_range;
-        mean += chart.axes.column(2).transpose() * by_sought / found.points.len() as f64;
+        mean += chart.ray.axes.column(2).transpose() * by_sought / found.points.len() as f64;
     }
     Some((mean * covariance * mean.transpose())[(0, 0)].sqrt())
 }

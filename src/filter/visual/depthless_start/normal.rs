@@ -3,18 +3,16 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
 use super::motion::{BySought, Sought};
+use crate::filter::visual::inverse_range::{LEAST_INVERSE_RANGE, Ray, axes_along};
 
-/// Points are looked for up to a distance of 10 km.
-const LEAST_INVERSE_RANGE: f64 = 1e-4;
 /// Information of a point along what it does not show, relative to that along what it does.
 const LEAST_INFORMATION: f64 = 1e-12;
 
-/// A point by its direction from where it was seen first and its inverse range `q`:
-/// `l = o + (x a_x + y a_y + a_z) / q`. What moves `(x, y, q)` keeps it before that camera.
+/// A point on the ray from where it was seen first. What moves it by the ray's parameters keeps it
+/// before that camera.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Chart {
-    from: Vector3<f64>,
-    pub axes: Matrix3<f64>,
+    pub ray: Ray,
     pub inverse_range: f64,
 }
 
@@ -22,16 +20,15 @@ impl Chart {
     /// Around a point as seen from a place; `None` at that place.
     pub fn around(point: &Vector3<f64>, from: Vector3<f64>) -> Option<Self> {
         let along = (point - from).try_normalize(0.0)?;
-        let across = along.cross(&Vector3::ith(along.iamin(), 1.0)).normalize();
-        let axes = Matrix3::from_columns(&[across, along.cross(&across), along]);
-        Some(Self { from, axes, inverse_range: (point - from).norm().recip() })
+        let ray = Ray { from, axes: axes_along(&along) };
+        Some(Self { ray, inverse_range: (point - from).norm().recip() })
     }
 
     /// The point after a step of its place, to first order.
     pub fn moved(&self, by: &Vector3<f64>) -> Vector3<f64> {
-        let by = self.axes.transpose() * by * self.inverse_range;
+        let by = self.ray.axes.transpose() * by * self.inverse_range;
         let inverse_range = (self.inverse_range * (1.0 - by.z)).max(LEAST_INVERSE_RANGE);
-        self.from + self.axes * Vector3::new(by.x, by.y, 1.0) / inverse_range
+        self.ray.point(&Vector3::new(by.x, by.y, inverse_range))
     }
 }
 

@@ -4,6 +4,7 @@ use nalgebra::{Isometry3, Matrix2, Matrix2x3, Matrix3, Point3, Vector2, Vector3}
 
 use super::StartView;
 use crate::filter::core::FilterError;
+use crate::filter::visual::inverse_range::axes_along;
 use crate::filter::visual::slam::MountedCamera;
 
 /// A view with its camera and its direction.
@@ -25,17 +26,14 @@ impl Sight {
         cameras: &[MountedCamera],
         frames: usize,
     ) -> Result<Self, FilterError> {
-        let (camera, count) = (view.camera, cameras.len());
-        let mounted = cameras.get(camera);
-        let mounted = mounted.ok_or(FilterError::UnknownCamera { camera, cameras: count })?;
+        let mounted = MountedCamera::among(cameras, view.camera)?;
         if view.frame >= frames {
             return Err(FilterError::UnknownClone(view.frame as u64));
         }
         let unseen = FilterError::NotFinite("direction of a view");
         let bearing = mounted.camera.bearing(view.pixel).ok_or(unseen)?.into_inner();
         let (_, by_point) = mounted.camera.project_with_jacobian(&bearing).ok_or(unseen)?;
-        let first = bearing.cross(&Vector3::ith(bearing.iamin(), 1.0)).normalize();
-        let across = Matrix2x3::from_rows(&[first.transpose(), bearing.cross(&first).transpose()]);
+        let across = axes_along(&bearing).fixed_columns::<2>(0).transpose();
         let not_positive = FilterError::NotPositive("covariance of a pixel");
         let root = view.pixel_covariance.cholesky().ok_or(not_positive)?.l();
         let weight = root.try_inverse().ok_or(not_positive)? * by_point * across.transpose();

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 /// Blocks of the Euclidean part that are no vectors of the world but of the body.
 pub(super) const BIASES: Range<usize> = 2..4;
+
 /// In what coordinates a filter has its errors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ErrorState {

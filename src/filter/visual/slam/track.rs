@@ -22,6 +22,16 @@ pub struct MountedCamera {
     pub body_from_camera: Isometry3<f64>,
 }
 
+impl MountedCamera {
+    /// The one of this index.
+    pub(in crate::filter::visual) fn among(
+        cameras: &[Self],
+        camera: usize,
+    ) -> Result<&Self, FilterError> {
+        cameras.get(camera).ok_or(FilterError::UnknownCamera { camera, cameras: cameras.len() })
+    }
+}
+
 /// Depth of a point in one view, by whatever measures it other than the pixels of the track.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackDepth {

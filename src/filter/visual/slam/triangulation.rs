@@ -1,8 +1,7 @@
 //! Where a track's point is, given the poses of its views, and what its rows are there.
 
 use nalgebra::{
-    Cholesky, DMatrix, DVector, Dyn, Isometry3, Matrix2, Matrix3, Matrix3x2, OMatrix, Point3, U3,
-    Vector3,
+    Cholesky, DMatrix, DVector, Dyn, Isometry3, Matrix2, Matrix3, OMatrix, Point3, U3, Vector3,
 };
 
 use super::state::{Block, JointState};
@@ -10,13 +9,11 @@ use super::track::{MountedCamera, Track, TrackView};
 use crate::alignment::MapEstimate;
 use crate::filter::core::{FilterError, finite};
 use crate::filter::visual::calibration::Calibration;
+use crate::filter::visual::inverse_range::{LEAST_INVERSE_RANGE, Ray, axes_along};
 
 /// Standard deviation of a pixel that defines the point, px: so far below what is measured of any
 /// other that it counts as exact.
 const DEFINING_SD: f64 = 1e-3;
-/// Points are looked for up to the distance of 10 km: nothing that a camera of a body sees from a
-/// window of poses tells it from infinity.
-const LEAST_INVERSE_RANGE: f64 = 1e-4;
 /// Steps of the search; it takes three to six.
 const STEPS: usize = 20;
 /// The search ends where a step moves the point by less than this, rad and relative to its range.
@@ -111,9 +108,7 @@ impl<'a> PlacedTrack<'a> {
         let clone = view.clone.0;
         let slot = state.clone_slot(view.clone).ok_or(FilterError::UnknownClone(clone))?;
         let (camera, track) = (view.camera, self.track.id);
-        let mounted = cameras.get(camera);
-        let mounted =
-            mounted.ok_or(FilterError::UnknownCamera { camera, cameras: cameras.len() })?;
+        let mounted = MountedCamera::among(cameras, camera)?;
         let seen_twice =
             self.views.iter().any(|v| (v.view.clone, v.view.camera) == (view.clone, camera));
         if seen_twice || state.clones[slot].has_used(track, camera) {
@@ -335,27 +330,6 @@ impl<'a> PlacedTrack<'a> {
     }
 }
 
-/// A point by its direction from a place and its inverse range: `l = o + (x a_x + y a_y + a_z) / q`,
-/// parameters `(x, y, q)`. In these a far point is as good as a near one.
-struct Ray {
-    /// World coordinates, m.
-    from: Vector3<f64>,
-    /// Columns: two axes across the direction, and the direction; world coordinates.
-    axes: Matrix3<f64>,
-}
-
-impl Ray {
-    fn point(&self, parameters: &Vector3<f64>) -> Vector3<f64> {
-        self.from + self.axes * Vector3::new(parameters.x, parameters.y, 1.0) / parameters.z
-    }
-
-    fn derivative(&self, parameters: &Vector3<f64>) -> Matrix3<f64> {
-        let across: Matrix3x2<f64> = self.axes.fixed_columns::<2>(0) / parameters.z;
-        let along = (self.from - self.point(parameters)) / parameters.z;
-        Matrix3::from_columns(&[across.column(0).into(), across.column(1).into(), along])
-    }
-}
-
 /// How parameters of a ray fit, whitened.
 struct Fit {
     parameters: Vector3<f64>,
@@ -405,12 +379,6 @@ fn pixel_weight(view: &TrackView) -> Result<Matrix2<f64>, FilterError> {
     let weight = root.try_inverse().ok_or(not_positive)?;
     finite("covariance of a pixel", weight.as_slice())?;
     Ok(weight)
-}
-
-/// Two axes across a direction and the direction itself, as columns.
-fn axes_along(direction: &Vector3<f64>) -> Matrix3<f64> {
-    let across = direction.cross(&Vector3::ith(direction.iamin(), 1.0)).normalize();
-    Matrix3::from_columns(&[across, direction.cross(&across), *direction])
 }
 
 /// The inverse of a normal matrix; the inverse range of a point that shows no parallax has a
