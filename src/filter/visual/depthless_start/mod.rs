@@ -118,6 +118,8 @@ struct Problem<'a> {
 /// A solution on its way.
 struct Iterate {
     sought: Sought,
+    /// At what is sought, a frame each.
+    motions: Vec<Motion>,
     /// In the first body's frame, m.
     points: Vec<Vector3<f64>>,
     /// Their directions and ranges from where they were seen first.
@@ -207,7 +209,7 @@ impl Problem<'_> {
     /// The closed form as a start, where all its points are before the cameras.
     fn closed_start(&self) -> Option<Iterate> {
         let (sought, points) = self.closed_form().ok()?;
-        self.at(sought, points, false)
+        self.at(sought, self.motions(&sought).ok()?, points, false)
     }
 
     /// A body at rest in the direction that the accelerometer says, its points at one range.
@@ -224,7 +226,8 @@ impl Problem<'_> {
             motion.rotation * in_body + motion.position(&resting)
         };
         let points = self.sights.iter().map(at_range).collect();
-        self.at(resting, points, false)
+        // Gravity is no part of what the IMU tells of the motion.
+        self.at(resting, motions, points, false)
     }
 
     /// The best of what the search comes to from several starts; the first that fits ends it.
@@ -253,10 +256,10 @@ impl Problem<'_> {
     fn at(
         &self,
         sought: Sought,
+        motions: Vec<Motion>,
         points: Vec<Vector3<f64>>,
         uses_magnitude: bool,
     ) -> Option<Iterate> {
-        let motions = self.motions(&sought).ok()?;
         let mut normal = Normal::empty(points.len());
         let mut cost = self.add_biases(&mut normal, &sought)?;
         if uses_magnitude {
@@ -277,7 +280,8 @@ impl Problem<'_> {
                 normal.add(k, &(residual * root), &by_point, &by_sought);
             }
         }
-        cost.is_finite().then_some(Iterate { sought, points, charts, normal, cost, uses_magnitude })
+        let iterate = Iterate { sought, motions, points, charts, normal, cost, uses_magnitude };
+        cost.is_finite().then_some(iterate)
     }
 
     /// The same with the magnitude of gravity, once it has a direction.
@@ -291,7 +295,7 @@ impl Problem<'_> {
             covariance.fixed_view::<3, 3>(start_block::GRAVITY, start_block::GRAVITY).into_owned();
         let sd = of_gravity.symmetric_eigenvalues().max().sqrt();
         if sd < HAS_DIRECTION * self.prior.gravity {
-            return self.at(iterate.sought, iterate.points, true);
+            return self.at(iterate.sought, iterate.motions, iterate.points, true);
         }
         Some(iterate)
     }
@@ -301,18 +305,18 @@ impl Problem<'_> {
         &self,
         iterate: &Iterate,
         sought: &Sought,
+        motions: &[Motion],
         moves: &[Vector3<f64>],
-    ) -> Option<Vec<Vector3<f64>>> {
-        let motions = self.motions(sought).ok()?;
+    ) -> Vec<Vector3<f64>> {
         let charts = iterate.charts.iter().zip(moves).zip(&self.sights).zip(&iterate.points);
         let moved = charts.map(|(((chart, by), sights), point)| {
             let sees = |sight: &Sight| {
-                let in_body = in_body(&motions, sight, sought, &(point + by));
+                let in_body = in_body(motions, sight, sought, &(point + by));
                 sight.bearing.dot(&sight.in_camera(&in_body)) > 0.0
             };
             if sights.iter().all(sees) { point + by } else { chart.moved(by) }
         });
-        Some(moved.collect())
+        moved.collect()
     }
 
     /// Levenberg's method from where `iterate` is.
@@ -322,8 +326,9 @@ impl Problem<'_> {
             iterate = self.with_magnitude(iterate)?;
             let next = iterate.normal.step(damping).and_then(|(step, moves)| {
                 let sought = iterate.sought + step;
-                let points = self.moved_points(&iterate, &sought, &moves)?;
-                self.at(sought, points, iterate.uses_magnitude)
+                let motions = self.motions(&sought).ok()?;
+                let points = self.moved_points(&iterate, &sought, &motions, &moves);
+                self.at(sought, motions, points, iterate.uses_magnitude)
             });
             match next.filter(|next| next.cost <= iterate.cost) {
                 Some(next) => {
@@ -393,7 +398,8 @@ pub fn start_without_depth(input: &StartInput<'_>) -> Result<StartSolution, Filt
     problem.motions(&problem.sought_of_prior())?;
     let coarse = problem.search().ok_or(failed)?;
     problem.huber = HUBER;
-    let fine = problem.at(coarse.sought, coarse.points, coarse.uses_magnitude).ok_or(failed)?;
+    let Iterate { sought, motions, points, uses_magnitude, .. } = coarse;
+    let fine = problem.at(sought, motions, points, uses_magnitude).ok_or(failed)?;
     let fine = problem.descend(fine).ok_or(failed)?;
     problem.solution(&fine, &ids).ok_or(failed)
 }
