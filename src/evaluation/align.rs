@@ -281,9 +281,7 @@ impl PointMoments {
         let (dimensions, deciding) = if alignment == Alignment::Yaw { (2, 0) } else { (3, 1) };
         let part = |covariance: &Matrix3<f64>| {
             let part = covariance.view((0, 0), (dimensions, dimensions)).into_owned();
-            let mut values = part.singular_values();
-            values.as_mut_slice().sort_by(|a, b| b.total_cmp(a));
-            values[deciding]
+            part.singular_values()[deciding]
         };
         let variances = part(&self.reference_covariance) * part(&self.estimate_covariance);
         let share = part(&self.covariance).powi(2) / variances;
