@@ -255,7 +255,9 @@ fn dot(a: &Window, b: &Window) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use proptest::prelude::*;
+    use nalgebra::Rotation2;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
     /// A smooth texture without repetition, drawn at `centre + warp * offset`.
     fn view(warp: &Matrix2<f64>, centre: Vector2<f64>, gain: f64, brightness: f64) -> Patch {
@@ -273,25 +275,32 @@ mod tests {
         Patch(patch)
     }
 
-    proptest! {
-        /// The reference point is the origin of the texture; the current view sees it turned,
-        /// scaled, brighter and off-centre.
-        #[test]
-        fn planted_shifts_are_found(
-            shift in [-2.0..2.0f64, -2.0..2.0], offset in [-1.0..1.0f64, -1.0..1.0],
-            turn in -0.5..0.5f64, scale in 0.8..1.25f64,
-            gain in 20.0..36.0f64, brightness in 115.0..140.0f64,
-        ) {
-            let (shift, offset) = (Vector2::from(shift), Vector2::from(offset));
-            let reference = view(&Matrix2::identity(), -offset, 40.0, 125.0);
-            let warp = Matrix2::new(turn.cos(), -turn.sin(), turn.sin(), turn.cos()) * scale;
-            let current = view(&warp, -(warp * shift), gain, brightness);
-            let found = current.align(&reference, offset, &warp, 4.0);
-            prop_assume!(found.is_some());
-            let found = found.unwrap();
-            prop_assert!((found.shift - shift).norm() < 0.06, "{} {}", found.shift, shift);
-            prop_assert!(found.correlation > 0.98);
-        }
+    /// The reference point is the origin of the texture; the current view sees it turned, scaled,
+    /// brighter and off-centre. Grey values are whole numbers and texture is weaker in some directions,
+    /// so errors have a tail: what is bounded are their quantiles.
+    #[test]
+    fn planted_shifts_are_found() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut within = |limit: f64| rng.random_range(-limit..limit);
+        let mut errors: Vec<f64> = (0..20_000)
+            .filter_map(|_| {
+                let shift = Vector2::new(within(2.0), within(2.0));
+                let offset = Vector2::new(within(1.0), within(1.0));
+                let (gain, brightness) = (28.0 + within(8.0), 127.0 + within(12.0));
+                let reference = view(&Matrix2::identity(), -offset, 40.0, 125.0);
+                let warp = Rotation2::new(within(0.5)).into_inner() * 1.25_f64.powf(within(1.0));
+                let current = view(&warp, -(warp * shift), gain, brightness);
+                let found = current.align(&reference, offset, &warp, 4.0)?;
+                assert!(found.correlation > 0.98, "{}", found.correlation);
+                Some((found.shift - shift).norm())
+            })
+            .collect();
+        errors.sort_by(f64::total_cmp);
+        let quantile = |share: f64| errors[(share * errors.len() as f64) as usize];
+        assert!(errors.len() > 19_500, "{}", errors.len());
+        assert!(quantile(0.5) < 0.011, "{}", quantile(0.5));
+        assert!(quantile(0.99) < 0.04, "{}", quantile(0.99));
+        assert!(errors[errors.len() - 1] < 0.15, "{}", errors[errors.len() - 1]);
     }
 
     #[test]
