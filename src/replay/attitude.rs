@@ -177,20 +177,24 @@ pub fn replay_attitude(
     metrics.step_time_ns = stepping.as_secs_f64() * 1e9 / metrics.samples.max(1) as f64;
     metrics.last = reached;
     if metrics.estimates == 0 && !metrics.interrupted {
-        return Err(ReplayError::NoAttitude {
-            log: request.log.clone(),
-            reason: format!(
-                "{} samples over {:.3} s, {} of them refused (not finite, or not later than the \
-                 one before), {} steps failed; accelerometer readings in m/s^2 over 0.1 s without a \
-                 gap are needed",
-                metrics.samples, metrics.log_seconds, metrics.refused, metrics.failed_steps,
-            ),
-        });
+        return Err(metrics.without_estimate(request));
     }
     Ok(metrics)
 }
 
 impl AttitudeMetrics {
+    fn without_estimate(&self, request: &AttitudeRequest) -> ReplayError {
+        let Self { samples, log_seconds, refused, failed_steps, .. } = self;
+        ReplayError::NoAttitude {
+            log: request.log.clone(),
+            reason: format!(
+                "{samples} samples over {log_seconds:.3} s, {refused} of them refused (not finite, \
+                 or not later than the one before), {failed_steps} steps failed; accelerometer \
+                 readings in m/s^2 over 0.1 s without a gap are needed"
+            ),
+        }
+    }
+
     fn count(&mut self, row: &ImuRow, step: &Result<AttitudeStep, FilterError>) {
         self.samples += 1;
         self.magnetic_samples += u64::from(row.magnetic_field.is_some());

@@ -134,11 +134,7 @@ pub fn replay(
     for (role, source) in &summary.sources {
         tracing::info!("{role}: {source}");
     }
-    let mut odometry =
-        Odometry::new(&config.odometry(), request.filter, request.seed, summary.has_imu)
-            .ok_or(ReplayError::Extrinsics)?;
-    let map_every = observers.iter().map(|observer| observer.map_every()).filter(|n| *n > 0).min();
-    odometry.report_map_every(map_every.unwrap_or(0));
+    let mut odometry = odometry(request, summary.has_imu, observers)?;
     let mut session = Session::start(request, summary.has_imu)?;
     let mut truth = Vec::new();
     let given = request.truth.as_deref().map(given_truth).transpose()?;
@@ -184,6 +180,20 @@ pub fn replay(
         write_metrics(directory, &replayed.metrics)?;
     }
     Ok(replayed)
+}
+
+/// The odometry of a run, which reports its map as often as the most eager observer asks for it.
+fn odometry(
+    request: &Request,
+    has_imu: bool,
+    observers: &[&mut dyn Observer],
+) -> Result<Odometry, ReplayError> {
+    let config = request.config.odometry();
+    let mut odometry = Odometry::new(&config, request.filter, request.seed, has_imu)
+        .ok_or(ReplayError::Extrinsics)?;
+    let map_every = observers.iter().map(|observer| observer.map_every()).filter(|n| *n > 0).min();
+    odometry.report_map_every(map_every.unwrap_or(0));
+    Ok(odometry)
 }
 
 /// How long a run took, s.
