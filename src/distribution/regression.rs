@@ -5,7 +5,8 @@
 //! the regression of `v_R`). Measurements that are linear in `(r, x)` keep the form exactly; the
 //! projection of `B` on `v_R` (W22 theorem 3.6) is needed only where an MFG is asked for.
 
-use nalgebra::{Const, Matrix3, SMatrix, SVector, Vector3};
+use nalgebra::allocator::Allocator;
+use nalgebra::{Const, DefaultAllocator, Dim, Matrix3, OMatrix, SMatrix, SVector, Vector3};
 
 use super::matrix_fisher::MatrixFisher;
 use super::matrix_fisher_gaussian::{
@@ -106,6 +107,7 @@ impl<const N: usize> RotationRegression<N> {
             measured.eta_r - measured.rx * by_offset - weighted.transpose() * surprise;
         self.offset += gain * surprise;
         self.slope += gain * surprise_slope;
+        keep_rounding(&mut self.covariance);
         self.covariance -= gain * columns.transpose();
         self.covariance = (self.covariance + self.covariance.transpose()) * 0.5;
         Some(self)
@@ -129,6 +131,18 @@ impl<const N: usize> RotationRegression<N> {
             deviation_covariance: deviation * rotation.covariance * deviation.transpose(),
         };
         MatrixFisherGaussian::from_moments(attitude, correlation, &moments)
+    }
+}
+
+/// Adds to the variances of a covariance from which some is about to be subtracted what the
+/// subtraction may be wrong by: `n` machine epsilons of each, since `|P_ij| <= sqrt(P_ii P_jj)`.
+pub fn keep_rounding<N: Dim>(covariance: &mut OMatrix<f64, N, N>)
+where
+    DefaultAllocator: Allocator<N, N>,
+{
+    let factor = 1.0 + covariance.nrows() as f64 * f64::EPSILON;
+    for k in 0..covariance.nrows() {
+        covariance[(k, k)] *= factor;
     }
 }
 

@@ -5,6 +5,7 @@ use nalgebra::allocator::Allocator;
 use nalgebra::{DefaultAllocator, Dim, OMatrix, OVector};
 
 use super::core::FilterError;
+use crate::distribution::regression::keep_rounding;
 
 /// A measurement `z = h(x) + noise`, linearised at the estimate: `residual = jacobian e + noise`
 /// with the errors `e` that start at row `first` of the state; all others have no part in it.
@@ -74,8 +75,11 @@ impl<N: Dim, M: Dim> Correction<N, M>
 where
     DefaultAllocator: Allocator<N> + Allocator<N, N> + Allocator<N, M> + Allocator<M, N>,
 {
-    /// Subtracts what was learned from the covariance that it was learned against.
+    /// Subtracts what was learned from the covariance that it was learned against. What rounding may
+    /// take away with it stays: a variance that was known to nothing may be known to a fraction of it
+    /// afterwards, and must not become negative.
     pub fn reduce(&self, covariance: &mut OMatrix<f64, N, N>) {
+        keep_rounding(covariance);
         covariance.gemm(-1.0, &self.gain_root, &self.gain_root.transpose(), 1.0);
     }
 }

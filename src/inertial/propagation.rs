@@ -109,8 +109,8 @@ impl Propagator {
 
     /// Motion of the body over the interval relative to its pose at the start and without
     /// gravity, its error being caused by the noises and by biases of the given means and
-    /// covariance: what a start at the identity, at rest, would lead to. `None` if it is not
-    /// finite.
+    /// covariance: what a start at the identity, at rest, would lead to, and the derivative of its
+    /// error by that of the start, the biases among it. `None` if it is not finite.
     pub fn relative_motion(
         &self,
         gyro: &Vector3<f64>,
@@ -118,7 +118,7 @@ impl Propagator {
         biases: &NavState,
         bias_covariance: &Matrix6<f64>,
         h: f64,
-    ) -> Option<Belief> {
+    ) -> Option<(Belief, NavCovariance)> {
         let state = NavState {
             world_from_body: Isometry3::identity(),
             velocity: Vector3::zeros(),
@@ -130,8 +130,8 @@ impl Propagator {
             .copy_from(bias_covariance);
         let mut motion = Belief { state, covariance };
         let weightless = Self { gravity: Vector3::zeros(), ..self.clone() };
-        weightless.step(&mut motion, gyro, accel, h);
-        motion.is_finite().then_some(motion)
+        let transition = weightless.step(&mut motion, gyro, accel, h);
+        motion.is_finite().then_some((motion, transition))
     }
 
     /// World coordinates, m/s^2; zero for the constant velocity model.

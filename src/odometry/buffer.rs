@@ -74,10 +74,10 @@ impl EventBuffer {
         &self.truth
     }
 
-    /// Keeps a sample; false if it is no later than the one before, or not finite.
+    /// Keeps a sample; false if it is no later than the one before, or not possible.
     pub fn push_imu(&mut self, sample: ImuSample) -> bool {
         self.advance(sample.stamp);
-        let keeps = follows(&mut self.last_imu, sample.stamp) && sample.is_finite();
+        let keeps = follows(&mut self.last_imu, sample.stamp) && sample.is_possible();
         if keeps {
             self.imu.push_back(sample);
         }

@@ -4,6 +4,8 @@ mod back_end;
 mod buffer;
 mod config;
 mod health;
+#[cfg(test)]
+mod hostile_events;
 mod init;
 mod levelling;
 mod pipeline;

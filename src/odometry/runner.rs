@@ -69,7 +69,7 @@ pub enum Observation<'a> {
 const LONGEST_SILENCE: f64 = 10.0;
 
 /// Why an event at `stamp` cannot belong to the run whose last one was at `last`.
-fn new_run(last: Stamp, stamp: Stamp) -> Option<String> {
+pub(super) fn new_run(last: Stamp, stamp: Stamp) -> Option<String> {
     let step = stamp.seconds_since(last);
     if step < 0.0 {
         Some(format!(

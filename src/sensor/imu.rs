@@ -2,6 +2,11 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::Stamp;
 
+/// rad/s.
+const MOST_RATE: f64 = 1e5;
+/// m/s^2.
+const MOST_FORCE: f64 = 1e8;
+
 /// One reading of the inertial measurement unit, in SI units, biases and noise included.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ImuSample {
@@ -26,9 +31,11 @@ impl ImuSample {
         }
     }
 
-    pub fn is_finite(&self) -> bool {
-        let finite = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
-        finite(&self.angular_velocity) && finite(&self.specific_force)
+    /// Whether a sensor may have read this, in whatever unit: finite, and below ten times what
+    /// ultracentrifuges reach. What is not is no measurement, and its squares would overflow.
+    pub fn is_possible(&self) -> bool {
+        let within = |v: &Vector3<f64>, most: f64| v.iter().all(|x| x.abs() <= most);
+        within(&self.angular_velocity, MOST_RATE) && within(&self.specific_force, MOST_FORCE)
     }
 }
 

@@ -188,7 +188,7 @@ impl AdaptiveAttitude {
         sample: &ImuSample,
         field: Option<&Vector3<f64>>,
     ) -> Result<AttitudeStep, FilterError> {
-        if !sample.is_finite() {
+        if !sample.is_possible() {
             return Ok(AttitudeStep::Refused);
         }
         let field = field.filter(|field| field.iter().all(|x| x.is_finite()));

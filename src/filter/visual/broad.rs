@@ -9,7 +9,7 @@ use super::zero_velocity::ZeroVelocity;
 use crate::alignment::{PointPair, PoseInformation, RobustKernel};
 use crate::distribution::matrix_fisher::MatrixFisher;
 use crate::distribution::progressive::{ProgressiveConfig, progressive_update};
-use crate::distribution::regression::JointInformation;
+use crate::distribution::regression::{JointInformation, keep_rounding};
 use crate::distribution::rotation_quadratic::{
     RotationMoments, RotationQuadratic, rotated_vector_by_rotation,
 };
@@ -102,8 +102,15 @@ impl BroadBelief {
         let (mean, covariance, _) = self.density.vector_moments(&self.rotation);
         let biases = nav_state(&Rotation3::identity(), &mean);
         let bias_covariance = covariance.fixed_view::<6, 6>(BIASES, BIASES).into_owned();
-        let motion = propagator.relative_motion(gyro, accel, &biases, &bias_covariance, h)?;
-        let moved = self.composed(&motion, &bias_covariance, propagator.gravity(), h)?;
+        let (motion, transition) =
+            propagator.relative_motion(gyro, accel, &biases, &bias_covariance, h)?;
+        let errors = MotionErrors {
+            motion: &motion,
+            by_bias: transition.fixed_columns::<6>(block::GYRO_BIAS).into_owned(),
+            bias_covariance: &bias_covariance,
+            turn: motion.state.world_from_body.rotation.to_rotation_matrix(),
+        };
+        let moved = self.composed(&errors, propagator.gravity(), h)?;
         let finite = moved.rotation.mean.iter().all(|x| x.is_finite())
             && moved.density.offset.iter().all(|x| x.is_finite())
             && moved.density.covariance.iter().all(|x| x.is_finite());
@@ -113,23 +120,12 @@ impl BroadBelief {
         finite.then_some(())
     }
 
-    fn composed(
-        &self,
-        motion: &Belief,
-        bias_covariance: &SMatrix<f64, 6, 6>,
-        gravity: &Vector3<f64>,
-        h: f64,
-    ) -> Option<Self> {
-        let turn = motion.state.world_from_body.rotation.to_rotation_matrix();
+    fn composed(&self, errors: &MotionErrors, gravity: &Vector3<f64>, h: f64) -> Option<Self> {
+        let MotionErrors { motion, by_bias, turn, .. } = errors;
         let rotation_error =
             motion.covariance.fixed_view::<3, 3>(block::ROTATION, block::ROTATION).into_owned();
-        let blur = Matrix3::identity()
-            + (rotation_error - Matrix3::identity() * rotation_error.trace()) * 0.5;
-        let by_bias = divided(
-            &motion.covariance.fixed_columns::<6>(block::GYRO_BIAS).into_owned(),
-            bias_covariance,
-        );
-        let drift_of_attitude = self.mean_drift(&by_bias, &turn);
+        let blur = mean_turn(&rotation_error);
+        let drift_of_attitude = self.mean_drift(by_bias, turn);
         let mean = self.attitude.mean() * turn.matrix() * blur + drift_of_attitude;
         let attitude = MatrixFisher::from_mean(&mean).ok()?;
 
@@ -155,8 +151,7 @@ impl BroadBelief {
         }
         let x = density.offset + density.slope * self.rotation.mean;
         density.slope *= turn.matrix().kronecker(&Matrix3::identity());
-        let errors = MotionErrors { motion, by_bias, bias_covariance, turn };
-        self.add_errors(&mut density, &errors, &drift)?;
+        self.add_errors(&mut density, errors, &drift)?;
         let mut moved = Self::new(attitude, density);
         // The regression is of first order in the errors, the mean is exact.
         moved.density.offset = x - moved.density.slope * moved.rotation.mean;
@@ -207,13 +202,18 @@ impl BroadBelief {
             advance * prior.fixed_columns::<6>(BIASES) * rotation_by_bias.transpose()
                 + mean_map * noise.fixed_columns::<3>(block::ROTATION);
         let parameter = Matrix3::from_column_slice(density.attitude.linear.as_slice());
-        let regression = with_rotation * gradient_coordinate(&parameter);
+        let rotation = density.attitude.moments().ok()?;
+        let regression = explicable(
+            with_rotation * gradient_coordinate(&parameter),
+            &rotation.covariance,
+            &density.covariance,
+        );
         // Biases that are known to depend on the attitude act accordingly.
         let slope_of_bias = density.slope.fixed_rows::<6>(BIASES).into_owned();
         density.slope += mean_map * motion_by_bias * slope_of_bias;
         density.slope += regression;
         // What the attitude tells is no longer unknown.
-        let rotation = density.attitude.moments().ok()?;
+        keep_rounding(&mut density.covariance);
         density.covariance -= regression * rotation.covariance * regression.transpose();
         symmetrize(&mut density.covariance);
         Some(())
@@ -294,7 +294,33 @@ impl BroadBelief {
     }
 }
 
-/// Errors of a relative motion: `by_bias * (bias error) + noise`.
+/// `E[exp(e^)]` of an error that accrues as Brownian motion does, of this covariance; of second order
+/// for any other (`E[e^ e^] = C - tr(C) I`). However large the error, it leads to no turn.
+fn mean_turn(covariance: &Matrix3<f64>) -> Matrix3<f64> {
+    let rate = (covariance - Matrix3::identity() * covariance.trace()) * 0.5;
+    let eigen = rate.symmetric_eigen();
+    let axes = eigen.eigenvectors;
+    axes * Matrix3::from_diagonal(&eigen.eigenvalues.map(f64::exp)) * axes.transpose()
+}
+
+/// A regression on `r` by which no more is told of `x` than there is of `covariance`: `regression`, or
+/// as much of it as that allows. Stein's identity holds where the error is small beside the spread of
+/// the attitude; an attitude that has become uncertain by it alone would seem to tell more.
+fn explicable(
+    regression: SMatrix<f64, EUCLIDEAN, 9>,
+    of_r: &SMatrix<f64, 9, 9>,
+    covariance: &SMatrix<f64, EUCLIDEAN, EUCLIDEAN>,
+) -> SMatrix<f64, EUCLIDEAN, 9> {
+    let eigen = covariance.symmetric_eigen();
+    let least = eigen.eigenvalues.max() * f64::EPSILON;
+    let scale =
+        eigen.eigenvalues.map(|value| value.max(least).max(f64::MIN_POSITIVE).sqrt().recip());
+    let whitened = SMatrix::from_diagonal(&scale) * eigen.eigenvectors.transpose() * regression;
+    let told = (whitened * of_r * whitened.transpose()).symmetric_eigenvalues().max();
+    if told > 1.0 { regression / told.sqrt() } else { regression }
+}
+
+/// Errors of a relative motion: `by_bias * (bias error at its start) + noise`.
 struct MotionErrors<'a> {
     motion: &'a Belief,
     by_bias: SMatrix<f64, 15, 6>,
@@ -344,12 +370,14 @@ pub fn of_belief(belief: &Belief, origin: &Vector3<f64>) -> Option<NavRegression
     let information = rotation_covariance.cholesky()?.inverse();
     let parameter =
         mode.matrix() * (Matrix3::identity() * (0.5 * information.trace()) - information);
+    let mut covariance =
+        belief.covariance.fixed_view::<EUCLIDEAN, EUCLIDEAN>(FIRST, FIRST).into_owned();
+    keep_rounding(&mut covariance);
     let density = NavRegression {
         attitude: RotationQuadratic::matrix_fisher(&parameter),
         offset: euclidean(&belief.state),
         slope: cross * gradient_coordinate(&parameter),
-        covariance: belief.covariance.fixed_view::<EUCLIDEAN, EUCLIDEAN>(FIRST, FIRST).into_owned()
-            - cross * information * cross.transpose(),
+        covariance: covariance - cross * information * cross.transpose(),
     };
     Some(shifted(density, &-origin))
 }
@@ -391,23 +419,6 @@ fn error_map(
     map.fixed_view_mut::<3, 3>(VELOCITY, block::VELOCITY).copy_from(before);
     map.fixed_view_mut::<3, 3>(POSITION, block::POSITION).copy_from(before);
     map
-}
-
-/// `cross covariance^-1` for a covariance that may be zero in some directions, about which
-/// nothing is correlated.
-fn divided(cross: &SMatrix<f64, 15, 6>, covariance: &SMatrix<f64, 6, 6>) -> SMatrix<f64, 15, 6> {
-    let scale = covariance.diagonal().map(|v| if v > 0.0 { v.sqrt().recip() } else { 0.0 });
-    let scaling = SMatrix::<f64, 6, 6>::from_diagonal(&scale);
-    let mut correlation = scaling * covariance * scaling;
-    for k in 0..6 {
-        if scale[k] == 0.0 {
-            correlation[(k, k)] = 1.0;
-        }
-    }
-    match correlation.cholesky() {
-        Some(factor) => cross * scaling * factor.inverse() * scaling,
-        None => SMatrix::zeros(),
-    }
 }
 
 /// (velocity, position, gyro bias, accelerometer bias).
@@ -506,7 +517,7 @@ mod tests {
             let mut state = nav_state(&r, &x);
             for _ in 0..steps {
                 // The motion's error drawn from its covariance, biases walking with it.
-                let motion = propagator
+                let (motion, _) = propagator
                     .relative_motion(&GYRO, &ACCEL, &state, &Matrix6::zeros(), h)
                     .unwrap();
                 let spread = motion.covariance + NavCovariance::identity() * 1e-18;
