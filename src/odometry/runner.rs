@@ -11,8 +11,16 @@ use crate::sensor::{Event, ImuSample, RgbdFrame, Stamp};
 use crate::tracking::FrontEndFrame;
 use crate::vision::Extraction;
 
-/// Finds the features of one frame; holds no state that one frame hands to the next.
+/// Finds the features of a log's frames, and may follow them from one frame to the next.
+///
+/// It is called on one thread, in order of the log, at any number of threads: what it makes depends
+/// on the log alone, and nothing of the estimate comes back to it.
 pub trait FrontEnd: Send {
+    /// The turn between frames may be predicted by it. Samples come up to the stamp of the next
+    /// frame, and possibly beyond or not quite as far: clocks differ.
+    fn imu(&mut self, _sample: &ImuSample) {}
+
+    /// # Errors
     /// A message that says why a frame has no features.
     fn features(&mut self, frame: &RgbdFrame) -> Result<Extraction, String>;
 }
@@ -171,7 +179,12 @@ fn prepare(event: Event, front_end: &mut dyn FrontEnd) -> Prepared {
                 seconds: start.elapsed().as_secs_f64(),
             })
         }
-        other => Prepared::Other(other),
+        other => {
+            if let Event::Imu(sample) = &other {
+                front_end.imu(sample);
+            }
+            Prepared::Other(other)
+        }
     }
 }
 

@@ -239,7 +239,7 @@ mod tests {
         let depth = DepthImage::new(SIZE.0, SIZE.1, 1e-4, depths).unwrap();
         FrontEndFrame {
             frame: Box::new(RgbdFrame { stamp: Stamp::default(), color, depth }),
-            extraction: Extraction { features: Vec::new(), pyramid },
+            extraction: Extraction { pyramid, ..Extraction::default() },
             seconds: 0.0,
         }
     }

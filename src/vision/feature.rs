@@ -1,6 +1,6 @@
 use std::sync::Arc;
 
-use nalgebra::{Matrix3, Point2, UnitVector3, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix3, Point2, UnitVector3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::{DepthReading, Patch, Pyramid};
@@ -114,10 +114,31 @@ impl Feature {
     }
 }
 
+/// Where one camera sees a point that is followed from frame to frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrackedFeature {
+    /// The point's: never given to another one, not even after it was lost.
+    pub id: u64,
+    /// Index of the camera, 0 being the first one.
+    pub camera: usize,
+    /// Position in the image as taken, px.
+    pub pixel: Point2<f64>,
+    /// Covariance of `pixel`, px^2. Zero in the first view: its surroundings are what all later
+    /// views are aligned to, so that view defines the point and has no error of its own.
+    pub pixel_covariance: Matrix2<f64>,
+    /// `None` where the depth image has no reading that can be trusted.
+    pub depth: Option<DepthReading>,
+    /// Of the point's first view.
+    pub descriptor: Option<Descriptor>,
+}
+
 /// What a front end makes of one frame.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Extraction {
     pub features: Vec<Feature>,
+    /// Points that are followed from frame to frame, in order of id and camera: a point that two
+    /// cameras see is in it twice. Empty where no tracker is on.
+    pub tracks: Vec<TrackedFeature>,
     /// What they were found in; empty where it is not kept.
     pub pyramid: Pyramid,
 }

@@ -18,7 +18,9 @@ mod select;
 mod stereo;
 
 pub use depth::{DepthConfig, DepthReading};
-pub use feature::{Descriptor, Extraction, Feature, FeatureConfig, PointMeasurement};
+pub use feature::{
+    Descriptor, Extraction, Feature, FeatureConfig, PointMeasurement, TrackedFeature,
+};
 pub use mask::{Mask, MaskConfig, MaskError};
 pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
 #[cfg(feature = "vision")]

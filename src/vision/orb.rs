@@ -154,7 +154,7 @@ impl OrbExtractor {
         let described = self.describe(&pyramid, &corners)?;
         let features = self.measure(frame, &pyramid, &described)?;
         let pyramid = if self.keeps_pyramid { self.copied(&pyramid)? } else { Pyramid::default() };
-        Ok(Extraction { features, pyramid })
+        Ok(Extraction { features, tracks: Vec::new(), pyramid })
     }
 
     fn copied(&self, levels: &[Mat]) -> Result<Pyramid, VisionError> {
@@ -436,7 +436,7 @@ mod tests {
         let covered = |f: &&Feature| mask.covers(f.pixel.x, f.pixel.y);
         assert!(features(&image).iter().filter(covered).count() > 50);
         let mut masked = extractor().keeping_pyramid(true).masked(mask.clone());
-        let Extraction { features, pyramid } = masked.extract(&image).unwrap();
+        let Extraction { features, pyramid, .. } = masked.extract(&image).unwrap();
         assert!(features.len() > 100);
         assert_eq!(features.iter().filter(covered).count(), 0);
         // Nor is there anything to be recognised at a predicted place.
