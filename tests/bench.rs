@@ -272,7 +272,6 @@ fn seven_scenes_without_stamps() {
 }
 
 #[test]
-#[ignore = "not run since its mend"]
 fn openloris_with_its_split_imu() {
     let root = tempfile::tempdir().unwrap();
     let mount = layouts::forward_mount(0.0);

@@ -49,7 +49,6 @@ fn goals_and_estimates_are_no_reference() {
 }
 
 #[test]
-#[ignore = "fails: see the reading of two IMUs"]
 fn the_faster_imu_is_taken_and_the_other_one_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let log = folder.path().join("log.mcap");

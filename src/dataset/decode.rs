@@ -148,10 +148,10 @@ impl RosSource {
             }
         }
         survey.choices(&chosen, log).iter().for_each(|line| tracing::info!("{line}"));
-        if let Some(topic) = survey.lone_gyroscope().filter(|_| !chosen.contains_key(&Role::Imu)) {
+        let summary = survey.summary_of(kind, &chosen, rig.as_ref());
+        if let Some(topic) = &summary.lone_gyroscope {
             tracing::warn!("imu: {topic} has no accelerometer, and no other topic has: not used");
         }
-        let summary = survey.summary_of(kind, &chosen, rig.as_ref());
         if rig.is_none() && summary.calibration.registration.is_none() {
             survey.check_sizes(path, &chosen)?;
         }

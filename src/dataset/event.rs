@@ -49,6 +49,8 @@ pub struct LogSummary {
     pub has_truth: bool,
     /// Chosen source for each role (`color`, `depth`, `imu`, `truth`): topic or file name.
     pub sources: BTreeMap<String, String>,
+    /// Source of a gyroscope that is not used since nothing holds an accelerometer.
+    pub lone_gyroscope: Option<String>,
     /// Number of frames, where the log knows it without being read through.
     pub frames: Option<u64>,
     /// Calibration of the color camera and its mounting on the IMU, where the log tells both.

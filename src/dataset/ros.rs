@@ -542,7 +542,7 @@ impl Survey {
 
     fn with_rate(&self, topic: &str) -> String {
         match self.observed.rate(topic) {
-            Some(rate) => format!("{topic} ({rate:.3} Hz)"),
+            Some(rate) => format!("{topic} ({} Hz)", (rate * 100.0).round() / 100.0),
             None => topic.to_owned(),
         }
     }
@@ -802,6 +802,10 @@ impl Survey {
                 .iter()
                 .map(|(role, name)| (role.key().to_owned(), name.clone()))
                 .collect(),
+            lone_gyroscope: self
+                .lone_gyroscope()
+                .filter(|_| !chosen.contains_key(&Role::Imu))
+                .cloned(),
             frames: None,
             camera: rig.map(StereoRig::camera).or(self.camera.as_ref()).cloned(),
             calibration: self.calibration(chosen),

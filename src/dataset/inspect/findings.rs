@@ -168,6 +168,13 @@ fn streams(findings: &mut Findings, inspection: &Inspection) {
         }
     }
     if inspection.topic("imu").is_none_or(|topic| topic.messages == 0) {
+        if let Some(gyroscope) = &inspection.summary.lone_gyroscope {
+            let text = format!(
+                "{gyroscope} is not used: its accelerometer reads zero throughout, or is marked as \
+                 absent, and no other topic has one"
+            );
+            findings.add(Severity::Warning, "imu", text);
+        }
         let text = "no IMU: a constant-velocity model takes its place".to_owned();
         findings.add(Severity::Note, "imu", text);
     }

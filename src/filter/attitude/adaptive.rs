@@ -436,17 +436,24 @@ fn guide_covariance(up: &BodyDirection, north: Option<&BodyDirection>) -> Matrix
 /// The attitude nearest to `attitude` that has `up`, a unit vector, in body coordinates.
 fn with_up(attitude: &Rotation3<f64>, up: &Vector3<f64>) -> Rotation3<f64> {
     let before = attitude.inverse() * Vector3::z();
-    let (cross, cosine) = (before.cross(up), before.dot(up));
+    attitude * exp(&-smallest_turn(&before, up))
+}
+
+/// The shortest rotation vector that turns the unit vector `from` to `to`; between opposite ones
+/// one of many.
+fn smallest_turn(from: &Vector3<f64>, to: &Vector3<f64>) -> Vector3<f64> {
+    let (cross, cosine) = (from.cross(to), from.dot(to));
     let sine = cross.norm();
-    let turn = if sine > f64::EPSILON {
-        cross * (sine.atan2(cosine) / sine)
-    } else if cosine > 0.0 {
-        Vector3::zeros()
-    } else {
-        // Opposite directions: a half turn about a horizontal axis.
-        attitude.inverse() * Vector3::x() * std::f64::consts::PI
-    };
-    attitude * exp(&-turn)
+    if cosine > 0.0 {
+        return if sine > 0.0 { cross * (sine.atan2(cosine) / sine) } else { cross };
+    }
+    // The axis is at right angles to the difference, too. Close to opposite directions rounding
+    // leaves little else of the cross product, and a half turn doubles an error of the axis.
+    let apart = (from - to).normalize();
+    let level = |axis: Vector3<f64>| axis - apart * apart.dot(&axis);
+    let any = || level(Vector3::ith(apart.iamin(), 1.0)).normalize();
+    let axis = level(cross).try_normalize(f64::EPSILON).unwrap_or_else(any);
+    axis * sine.atan2(cosine)
 }
 
 fn with_up_of(attitude: &Rotation3<f64>, other: &Rotation3<f64>) -> Rotation3<f64> {
@@ -465,10 +472,11 @@ fn isotropic(mean: Vector3<f64>, variance: f64) -> VectorEstimate {
 mod tests {
     use approx::assert_relative_eq;
     use nalgebra::Rotation3;
+    use std::f64::consts::PI;
 
     use super::*;
     use crate::sensor::Stamp;
-    use crate::so3::log;
+    use crate::so3::{angle_between, log};
 
     const WITH_BIAS: [AttitudeFilterKind; 7] = [
         AttitudeFilterKind::Mekf,
@@ -547,11 +555,11 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "fails at exactly half a turn"]
     fn an_attitude_is_levelled_by_the_smallest_turn() {
         let attitude = exp(&Vector3::new(0.4, -1.0, 0.7));
         let own = attitude.inverse() * Vector3::z();
-        for turn in [0.0, 1e-17, 1e-9, 0.3, 3.0, std::f64::consts::PI] {
+        let half = [1e-2, 1e-6, 1e-9, 1e-12, 1e-15, 0.0].map(|short| PI - short);
+        for turn in [0.0, 1e-17, 1e-9, 0.3, 3.0].into_iter().chain(half) {
             let axis = own.cross(&Vector3::x()).normalize();
             let up = exp(&(axis * turn)) * own;
             let level = with_up(&attitude, &up);
@@ -574,7 +582,7 @@ mod tests {
         assert_eq!(step(sample(0.05)), AttitudeStep::Propagated);
         assert!(matches!(step(sample(0.1)), AttitudeStep::Updated(_)));
         let estimate = estimator.estimate().unwrap();
-        assert!(estimate.world_from_body.angle_to(&Rotation3::identity()) < 1e-6);
+        assert!(log(&estimate.world_from_body).norm() < 1e-6);
     }
 
     /// Of each filter; after a rest of 5 s and a gap.
@@ -592,7 +600,6 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "fails: mekf after 10000 s"]
     fn a_gap_makes_the_attitude_uncertain_by_what_may_have_been_missed() {
         let sd = |estimate: &Estimate| {
             let variance = estimate.rotation_covariance.symmetric_eigenvalues().min();
@@ -608,7 +615,7 @@ mod tests {
                 assert!(sd(&before) < 1.0, "{kind}: {}", sd(&before));
                 assert!(range.contains(&sd(&after)), "{kind}, {seconds} s: {}", sd(&after));
                 assert!(sd(&later) < 2.0, "{kind}, {seconds} s: {}", sd(&later));
-                let error = later.world_from_body.angle();
+                let error = log(&later.world_from_body).norm();
                 assert!(error < 0.02, "{kind}, {seconds} s: {error}");
             }
         }
@@ -616,7 +623,6 @@ mod tests {
 
     /// Without a magnetometer: the density says nothing of the heading, the gyroscope does.
     #[test]
-    #[ignore = "fails: mfgia is NaN after 3 s"]
     fn the_heading_is_that_of_the_gyroscope_where_nothing_else_shows_it() {
         for kind in AttitudeFilterKind::ALL {
             let mut estimator = AdaptiveAttitude::new(kind, &AdaptiveConfig::default());
@@ -637,7 +643,7 @@ mod tests {
                 let Some(estimate) = estimator.estimate() else { continue };
                 let turn = estimate.world_from_body * now.inverse();
                 let offset = *first.get_or_insert(turn);
-                let error = turn.angle_to(&offset).to_degrees();
+                let error = angle_between(&turn, &offset).to_degrees();
                 assert!(error < 1.0, "{kind}: {error} degrees at {t} s");
                 let up = now.inverse() * Vector3::z();
                 let heading = up.dot(&(estimate.rotation_covariance * up));

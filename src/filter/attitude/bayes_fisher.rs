@@ -143,6 +143,7 @@ impl BayesFilter for BayesFisher {
             Frame::Body => mean.turned(&turn),
             Frame::World => mean.turned_in_world(&turn),
         };
+        super::finite_belief(&mean.mode, mean.complement.as_slice())?;
         if self.map == MomentMap::Approximate {
             let svd = self.map.parameter(&mean, &self.last)?;
             (self.mean, self.last) = self.map.mean(&svd)?;

@@ -178,8 +178,9 @@ impl BayesFilter for FastNonlinear {
             Frame::Body => self.mode * turn,
             Frame::World => turn * self.mode,
         };
-        self.covariance = self.propagated(&next, step);
-        self.mode = next;
+        let covariance = self.propagated(&next, step);
+        super::finite_belief(&next, covariance.as_slice())?;
+        (self.mode, self.covariance) = (next, covariance);
         Ok(())
     }
 
@@ -203,7 +204,7 @@ impl BayesFilter for FastNonlinear {
         let fisher =
             information.and_then(|h| MatrixFisher::from_mode_and_information(self.mode, h).ok());
         fisher.map_or_else(
-            || Estimate::of_attitude(self.mode, in_body),
+            || Estimate::of_attitude(self.mode, super::wrapped(in_body)),
             |fisher| Estimate::of_matrix_fisher(&fisher),
         )
     }

@@ -45,6 +45,33 @@ impl GaussianBelief {
         self.bias += correction.fixed_rows::<3>(3);
     }
 
+    /// Carries the belief through an interval, linearised at the mean.
+    pub fn propagate(&mut self, gyro: &GyroModel, step: &InertialStep) -> Result<(), FilterError> {
+        let h = step.seconds;
+        let Self { error, attitude, bias, covariance } = self;
+        let angle = (step.angular_velocity - *bias) * h;
+        let turn = exp(&angle);
+        // Body: e+ = E^T e - h J_r b - n. World: e+ = e - R (h J_l b + E n).
+        let noise = gyro.angle_covariance(step);
+        let (by_error, by_bias, q) = match error {
+            Frame::Body => (turn.inverse().into_inner(), right_jacobian(&angle) * -h, noise),
+            Frame::World => (
+                Matrix3::identity(),
+                attitude.matrix() * left_jacobian(&angle) * -h,
+                conjugated(&(*attitude * turn), &noise),
+            ),
+        };
+        let mut transition = Matrix6::identity();
+        transition.fixed_view_mut::<3, 3>(0, 0).copy_from(&by_error);
+        transition.fixed_view_mut::<3, 3>(0, 3).copy_from(&by_bias);
+        let noise = joint_covariance(&q, &(gyro.bias_walk * h));
+        let covariance = transition * *covariance * transition.transpose() + noise;
+        let attitude = *attitude * turn;
+        super::finite_belief(&attitude, covariance.as_slice())?;
+        (self.attitude, self.covariance) = (attitude, covariance);
+        Ok(())
+    }
+
     /// Conditions on a measured bias, in Joseph's form.
     pub fn condition_on_bias(&mut self, measured: &VectorEstimate) -> Result<(), FilterError> {
         let residual = measured.mean - self.bias;
@@ -58,7 +85,7 @@ impl GaussianBelief {
         let posterior = kept * self.covariance * kept.transpose()
             + gain * measured.covariance * gain.transpose();
         let correction = gain * residual;
-        super::finite("posterior", correction.as_slice())?;
+        super::finite("correction", &[correction.norm_squared()])?;
         super::finite("posterior", posterior.as_slice())?;
         self.covariance = 0.5 * (posterior + posterior.transpose());
         self.apply(&correction);
@@ -74,7 +101,7 @@ impl GaussianBelief {
         let covariance = self.covariance.fixed_view::<3, 3>(3, 3).into_owned();
         Estimate {
             gyro_bias: Some(VectorEstimate { mean: self.bias, covariance }),
-            ..Estimate::of_attitude(self.attitude, in_body)
+            ..Estimate::of_attitude(self.attitude, super::wrapped(in_body))
         }
     }
 }
@@ -111,7 +138,7 @@ impl AttitudeMekf {
         left -= gain * information;
         let covariance = kept * prior * kept.transpose() + gain * information * gain.transpose();
         let correction = gain * vector;
-        super::finite("posterior", correction.as_slice())?;
+        super::finite("correction", &[correction.norm_squared()])?;
         super::finite("posterior", covariance.as_slice())?;
         self.belief.covariance = 0.5 * (covariance + covariance.transpose());
         self.belief.apply(&correction);
@@ -137,27 +164,7 @@ impl BayesFilter for AttitudeMekf {
 
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
-        let h = step.seconds;
-        let GaussianBelief { error, attitude, bias, covariance } = &mut self.belief;
-        let angle = (step.angular_velocity - *bias) * h;
-        let turn = exp(&angle);
-        // Body: e+ = E^T e - h J_r b - n. World: e+ = e - R (h J_l b + E n).
-        let noise = self.gyro.angle_covariance(step);
-        let (by_error, by_bias, q) = match error {
-            Frame::Body => (turn.inverse().into_inner(), right_jacobian(&angle) * -h, noise),
-            Frame::World => (
-                Matrix3::identity(),
-                attitude.matrix() * left_jacobian(&angle) * -h,
-                conjugated(&(*attitude * turn), &noise),
-            ),
-        };
-        let mut transition = Matrix6::identity();
-        transition.fixed_view_mut::<3, 3>(0, 0).copy_from(&by_error);
-        transition.fixed_view_mut::<3, 3>(0, 3).copy_from(&by_bias);
-        let noise = joint_covariance(&q, &(self.gyro.bias_walk * h));
-        *covariance = transition * *covariance * transition.transpose() + noise;
-        *attitude *= turn;
-        Ok(())
+        self.belief.propagate(&self.gyro, step)
     }
 
     fn update_attitude(&mut self, measured: &AttitudeMeasurement) -> Result<(), FilterError> {

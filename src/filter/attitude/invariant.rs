@@ -45,7 +45,7 @@ impl InvariantKalman {
         let prior = self.covariance.try_inverse().ok_or(SINGULAR)?;
         let covariance = symmetric(&(prior + information).try_inverse().ok_or(SINGULAR)?);
         let correction = covariance * vector;
-        super::finite("posterior", correction.as_slice())?;
+        super::finite("correction", &[correction.norm_squared()])?;
         self.covariance = covariance;
         self.attitude = match self.error {
             Frame::World => exp(&correction) * self.attitude,
@@ -143,12 +143,13 @@ impl BayesFilter for InvariantKalman {
         let turn = exp(&(step.angular_velocity * step.seconds));
         let q = self.gyro.angle_covariance(step);
         let frames = (self.error, self.gyro.frame);
-        self.covariance =
-            propagated_covariance(&self.covariance, frames, &self.attitude, &turn, &q);
-        self.attitude = match self.gyro.frame {
+        let covariance = propagated_covariance(&self.covariance, frames, &self.attitude, &turn, &q);
+        let attitude = match self.gyro.frame {
             Frame::Body => self.attitude * turn,
             Frame::World => turn * self.attitude,
         };
+        super::finite_belief(&attitude, covariance.as_slice())?;
+        (self.attitude, self.covariance) = (attitude, covariance);
         Ok(())
     }
 
@@ -175,6 +176,6 @@ impl BayesFilter for InvariantKalman {
             Frame::World => conjugated(&self.attitude.inverse(), &self.covariance),
             Frame::Body => self.covariance,
         };
-        Estimate::of_attitude(self.attitude, in_body)
+        Estimate::of_attitude(self.attitude, super::wrapped(in_body))
     }
 }

@@ -63,6 +63,9 @@ pub use wahba::wahba;
 /// `(pi^2/3 + 2)/3`.
 pub const UNIFORM_VARIANCE: f64 = (std::f64::consts::PI * std::f64::consts::PI / 3.0 + 2.0) / 3.0;
 
+/// Variance of an angle that is uniform on the circle, rad^2: `pi^2/3`.
+const UNIFORM_ANGLE_VARIANCE: f64 = std::f64::consts::PI * std::f64::consts::PI / 3.0;
+
 /// The gyroscope: `measured = true + bias + white noise`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GyroModel {
@@ -263,6 +266,24 @@ impl FromStr for AttitudeFilterKind {
             format!("unknown filter `{text}`; there are: {}", names.join(", "))
         })
     }
+}
+
+/// Refuses a belief of an attitude and a covariance that are not finite.
+fn finite_belief(attitude: &Rotation3<f64>, covariance: &[f64]) -> Result<(), FilterError> {
+    finite("propagated attitude", attitude.matrix().as_slice())?;
+    finite("propagated covariance", covariance)
+}
+
+/// The covariance of the rotation vector of a Gaussian belief, no axis broader than a uniform
+/// angle. A Gaussian counts the turns that may have been made; of an attitude, which does not, its
+/// variance about an axis says nothing beyond this.
+fn wrapped(covariance: Matrix3<f64>) -> Matrix3<f64> {
+    if covariance.trace() <= UNIFORM_ANGLE_VARIANCE {
+        return covariance;
+    }
+    let eigen = SymmetricEigen::new(covariance);
+    let variance = eigen.eigenvalues.map(|v| v.min(UNIFORM_ANGLE_VARIANCE));
+    eigen.eigenvectors * Matrix3::from_diagonal(&variance) * eigen.eigenvectors.transpose()
 }
 
 /// Refuses an angular velocity in world coordinates, for filters with a bias.

@@ -16,6 +16,9 @@ const LAMBDA: f64 = 1.0;
 /// Dimension of (rotation vector, bias).
 const N: usize = 6;
 const POINTS: usize = 2 * N + 1;
+/// Angle from the centre, rad, beyond which a sigma point would come back from the other side and
+/// make a belief narrow that is broad; the interval is then linearised.
+const LONGEST_REACH: f64 = std::f64::consts::PI;
 
 /// A Gaussian of the body-frame rotation vector and the bias, carried by thirteen sigma points:
 /// Crassidis and Markley's filter, with rotation vectors for Rodrigues parameters.
@@ -64,7 +67,7 @@ impl AttitudeUkf {
         let covariance = 0.5 * (covariance + covariance.transpose());
         covariance.cholesky().ok_or(FilterError::NotPositive("posterior covariance"))?;
         let correction = -gain * mean;
-        super::finite("posterior", correction.as_slice())?;
+        super::finite("correction", &[correction.norm_squared()])?;
         self.belief.covariance = covariance;
         Ok(correction)
     }
@@ -88,11 +91,17 @@ impl BayesFilter for AttitudeUkf {
         "ukf"
     }
 
+    /// By sigma points; where they would reach too far, linearised.
     fn propagate(&mut self, step: &InertialStep) -> Result<(), FilterError> {
         step.check()?;
         let h = step.seconds;
         let half = joint_covariance(&(self.gyro.angle_covariance(step) * 0.5), &Matrix3::zeros());
         let deviations = self.deviations(&(self.belief.covariance + half))?;
+        let reach =
+            |d: &Vector6<f64>| d.fixed_rows::<3>(0).norm() + d.fixed_rows::<3>(3).norm() * h;
+        if deviations.iter().any(|d| reach(d) > LONGEST_REACH) {
+            return self.belief.propagate(&self.gyro, step);
+        }
         let turned = |d: &Vector6<f64>| {
             let rate = step.angular_velocity - self.belief.bias - d.fixed_rows::<3>(3);
             rotation_part(d) * exp(&(rate * h))
@@ -112,7 +121,9 @@ impl BayesFilter for AttitudeUkf {
         }
         covariance += joint_covariance(&Matrix3::zeros(), &(self.gyro.bias_walk * h));
         covariance.cholesky().ok_or(FilterError::NotPositive("covariance"))?;
-        self.belief.attitude *= centre;
+        let attitude = self.belief.attitude * centre;
+        super::finite_belief(&attitude, covariance.as_slice())?;
+        self.belief.attitude = attitude;
         self.belief.covariance = 0.5 * (covariance + covariance.transpose());
         self.belief.apply(&mean);
         Ok(())

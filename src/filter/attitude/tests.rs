@@ -12,7 +12,7 @@ use crate::filter::{AttitudeMeasurement, Estimate, InertialStep, VectorMeasureme
 use crate::so3::{HaarQuadrature, exp, log, sample_haar};
 
 /// One reading of a stream.
-#[derive(Clone)]
+#[derive(Clone, Debug)]
 enum Event {
     Step(InertialStep),
     Directions(Vec<VectorMeasurement>),
@@ -255,6 +255,54 @@ fn what_cannot_be_used_is_refused_and_changes_nothing() {
         let refused = filter.update_position(&position).unwrap_err().to_string();
         assert!(refused.contains(kind.name()), "{refused}");
     }
+}
+
+/// Readings that are finite but absurd: refused, or survived.
+#[test]
+fn no_reading_makes_a_belief_infinite() {
+    let scales = [0.0, 1e-300, 1e-160, 1e-9, 1.0, 1e9, 1e160, 1e300];
+    for kind in AttitudeFilterKind::ALL {
+        let mut events = Vec::new();
+        for x in scales {
+            for y in scales {
+                let step = InertialStep::turning(Vector3::new(x, -x, 0.5 * x), y);
+                events.push(Event::Step(step));
+                let covariance = Matrix3::from_diagonal(&Vector3::new(x, y, x));
+                let step = InertialStep::turning(Vector3::repeat(0.1), 0.01);
+                events.push(Event::Step(step.with_angle_covariance(covariance)));
+                events.push(Event::Directions(vec![VectorMeasurement {
+                    in_world: Vector3::z(),
+                    in_body: Vector3::new(1.0, 0.0, 1.0) * x,
+                    measured_in: Frame::Body,
+                    covariance: Matrix3::from_diagonal_element(y),
+                }]));
+                let noise = Matrix3::from_diagonal(&Vector3::new(x, y, 1.0));
+                let attitude = AttitudeMeasurement { world_from_body: exp(&Vector3::x()), noise };
+                events.push(Event::Attitude(attitude));
+            }
+        }
+        for (k, event) in events.iter().enumerate() {
+            let p = prior(exp(&Vector3::new(0.3, 1.0, -0.4)), [30.0, 20.0, 5.0]);
+            let mut filter = kind.start(&GyroModel::isotropic(SD, 1e-3), &p).unwrap();
+            for event in [event, &events[(7 * k + 3) % events.len()], event] {
+                let before = filter.attitude();
+                let refused = match event {
+                    Event::Step(step) => filter.propagate(step).is_err(),
+                    Event::Directions(vectors) => filter.update_directions(vectors).is_err(),
+                    Event::Attitude(attitude) => filter.update_attitude(attitude).is_err(),
+                };
+                let what = || format!("{kind}, {k}: {event:?}, refused: {refused}");
+                assert!(is_finite(&filter.estimate()), "{}", what());
+                assert!(!refused || filter.attitude() == before, "{}", what());
+            }
+        }
+    }
+}
+
+fn is_finite(estimate: &Estimate) -> bool {
+    let bias = estimate.gyro_bias.iter().flat_map(|b| b.mean.iter().chain(b.covariance.iter()));
+    let attitude = estimate.world_from_body.matrix().iter();
+    attitude.chain(estimate.rotation_covariance.iter()).chain(bias).all(|x| x.is_finite())
 }
 
 #[test]

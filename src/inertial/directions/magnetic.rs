@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, Rotation3, SMatrix, SVector, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::{CorrelatedError, InertialDirection, Interval};
+use crate::so3::angle_between;
 
 /// How far the magnetometer is believed to show north. Fields are relative to the magnitude of
 /// the first one measured.
@@ -190,7 +191,7 @@ impl MagneticFinder {
     ) {
         let config = &self.config;
         let drift = config.field_walk.powi(2) + bias_variance * BIAS_MEMORY;
-        let turned = self.iron_attitude.angle_to(inertial_from_body);
+        let turned = angle_between(&self.iron_attitude, inertial_from_body);
         let has_turned = turned > config.iron_turn;
         let changed = if has_turned { config.iron_walk.powi(2) * turned } else { 0.0 };
         for i in 0..3 {
