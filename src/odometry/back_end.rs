@@ -10,7 +10,8 @@ use super::window::ImuWindow;
 use crate::alignment::PointPair;
 use crate::filter::{
     FilterConfig, FilterError, FilterKind, FrameChange, InertialStep, MapEstimate, MapTreatment,
-    PointObservation, PointUpdate, VisualInertialFilter, ZeroVelocity,
+    MountedCamera, PointObservation, PointUpdate, Track, TrackUpdate, VisualInertialFilter,
+    ZeroVelocity,
 };
 use crate::inertial::Belief;
 use crate::map::{Map, MapConfig, Sighting};
@@ -204,6 +205,19 @@ impl BackEnd {
             self.map.carry(&Isometry3::from_parts(Translation3::identity(), turn));
         }
         Ok(change)
+    }
+
+    /// Conditions the belief on tracks of points seen from past poses.
+    pub fn update_tracks(
+        &mut self,
+        tracks: &[Track],
+        cameras: &[MountedCamera],
+    ) -> Result<TrackUpdate, FilterError> {
+        let name = self.filter.cannot_use("tracks");
+        let window = self.filter.pose_window_mut().ok_or(name)?;
+        let update = window.update_tracks(tracks, cameras)?;
+        self.follow(&update.frame);
+        Ok(update)
     }
 
     /// Moves the map as an update changed the world: turned, or with the camera, by which its points

@@ -17,6 +17,9 @@ mod run;
 mod runner;
 mod state_points;
 mod supervisor;
+mod track_window;
+#[cfg(test)]
+mod track_window_tests;
 mod truth;
 mod window;
 

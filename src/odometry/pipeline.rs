@@ -15,6 +15,7 @@ use super::rest::RestDetector;
 use super::restart::{Legacy, Spread};
 use super::run::Run;
 use super::supervisor::{FrameEvidence, Supervisor};
+use super::track_window::TrackWindow;
 use super::truth::TruthTrack;
 use super::window::{ImuCursor, ImuWindow};
 use crate::fault::{Divergence, Episode};
@@ -236,6 +237,7 @@ impl Odometry {
         run.refine_tracks(&mut tracks, front, &mut view, &prediction);
 
         let update = run.update(&tracks, &view);
+        run.use_followed(front, &tracks, &view, time);
         let seen = FrameEvidence {
             stamp: time,
             expected: std::mem::replace(&mut run.expects_matches, true),
@@ -344,6 +346,7 @@ impl Odometry {
             cursor,
             rest: RestDetector::new(&self.config.standstill, imu),
             levelling,
+            track_window: TrackWindow::new(filter),
             gauge: Spread::default(),
             configured_mounting: self.body_from_camera,
             expects_matches: false,

@@ -10,9 +10,13 @@ use super::report::{KeypointRole, KeypointView, Note, StageTimes, StepCounts, St
 use super::rest::RestDetector;
 use super::restart::Spread;
 use super::supervisor::{FrameEvidence, PoseVerdict, Supervisor};
+use super::track_window::{FrameSights, PointSight, TrackWindow};
 use super::window::{ImuCursor, ImuWindow};
 use crate::fault::Obstruction;
-use crate::filter::{Calibration, FilterConfig, PointObservation, PointUpdate};
+use crate::filter::{
+    Calibration, FilterConfig, MountedCamera, PointObservation, PointUpdate, TrackDepth,
+    TrackUpdate,
+};
 use crate::inertial::{Belief, NavCovariance};
 use crate::map::{ReferenceView, Sighting};
 use crate::sensor::Stamp;
@@ -20,7 +24,7 @@ use crate::so3::ProperSvd;
 use crate::tracking::{
     FrameTracker, FrontEndFrame, Prediction, Tracks, View, first_reference, in_body, reference,
 };
-use crate::vision::Feature;
+use crate::vision::{Feature, PATCH_RADIUS, TrackedFeature};
 
 /// What exists once the filter has started.
 pub(super) struct Run {
@@ -28,6 +32,7 @@ pub(super) struct Run {
     pub cursor: ImuCursor,
     pub rest: RestDetector,
     pub levelling: Levelling,
+    pub track_window: TrackWindow,
     /// What is not known of where this start is in the world of the first one. It is no part of
     /// the belief: nothing that is measured can tell of it.
     pub gauge: Spread,
@@ -124,6 +129,7 @@ impl Run {
                 if let Some(points) = self.back_end.filter_mut().point_state_mut() {
                     points.reset_pose(&way, &spread_of_recognition(filter));
                 }
+                self.track_window.clear(&mut self.back_end);
                 supervisor.observe_kidnapping(stamp);
                 prediction.belief = *self.belief();
                 view.shutter = prediction.shutter(view.config, view.size.1, None);
@@ -169,6 +175,25 @@ impl Run {
             .collect();
         let updated = self.back_end.update(self.seeing_frames, &seen);
         updated.inspect_err(|error| tracing::debug!("no update: {error}")).ok()
+    }
+
+    /// Conditions the belief on points that were followed through past poses.
+    pub fn use_followed(
+        &mut self,
+        front: &FrontEndFrame,
+        tracks: &Tracks,
+        view: &View,
+        time: Stamp,
+    ) -> Option<TrackUpdate> {
+        let seen = FrameSights {
+            time,
+            points: sights(front, tracks, view),
+            cameras: vec![MountedCamera {
+                camera: *view.camera,
+                body_from_camera: view.body_from_camera,
+            }],
+        };
+        self.track_window.advance(&mut self.back_end, &seen)
     }
 
     /// Compares the turns that the images and the gyroscope see. Gives how much the clocks turn out
@@ -368,6 +393,39 @@ impl Run {
         let reported = Belief { state, covariance: self.reported_covariance() };
         reported.attitude().map(|attitude| *attitude.svd())
     }
+}
+
+/// What a frame shows of followed points that it does not measure as points of the map, too: the same
+/// grey values must not count twice.
+fn sights(front: &FrontEndFrame, tracks: &Tracks, view: &View) -> Vec<PointSight> {
+    let features = &front.extraction.features;
+    let measured: Vec<_> = tracks.agreeing().map(|m| features[m.feature].pixel).collect();
+    let is_apart = |pixel: &Point2<f64>| {
+        measured.iter().all(|other| (pixel - other).amax() > PATCH_RADIUS as f64)
+    };
+    let followed = front.extraction.tracks.iter().filter(|seen| seen.camera == 0);
+    followed.filter(|seen| is_apart(&seen.pixel)).filter_map(|seen| sight(seen, view)).collect()
+}
+
+/// Of a point without depth what its direction does while rows are exposed is known, but not what its
+/// distance adds.
+fn sight(seen: &TrackedFeature, view: &View) -> Option<PointSight> {
+    /// m.
+    const FAR: f64 = 1e3;
+    let depth = seen.depth.map_or(FAR, |reading| reading.depth);
+    let point = view.camera.unproject(seen.pixel, depth)?;
+    let pixel = match view.shutter.is_rolling() {
+        true => view.camera.project(&view.shutter.at_stamp(&point, view.row(seen.pixel)))?,
+        false => seen.pixel,
+    };
+    // What a depth image gets wrong of a point it gets wrong in all views of it.
+    let depth = seen.depth.map(|reading| TrackDepth {
+        depth: reading.depth,
+        variance: 0.0,
+        common_variance: reading.standard_deviation.powi(2),
+    });
+    let (id, camera, pixel_covariance) = (seen.id, seen.camera, seen.pixel_covariance);
+    Some(PointSight { id, camera, pixel, pixel_covariance, depth })
 }
 
 fn observation(

@@ -25,7 +25,7 @@ pub use mask::{Mask, MaskConfig, MaskError};
 pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
 #[cfg(feature = "vision")]
 pub use orb::{OrbExtractor, VisionError};
-pub use patch::{Patch, PatchConfig};
+pub use patch::{PATCH_RADIUS, Patch, PatchConfig};
 pub use pyramid::{Glimpse, Pyramid};
 pub use ransac::{Correspondence, RansacConfig, agree_near, agreeing, estimate_pose};
 pub use registration::DepthRegistration;

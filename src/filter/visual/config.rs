@@ -51,6 +51,11 @@ pub struct FilterConfig {
     pub state_min_observations: u32,
     /// Points of the state not seen for more than this many frames make room for others.
     pub state_max_unseen_frames: u64,
+    /// Past poses that `mfgs`, `iekfs` and `mekfs` keep in their state for tracks; 0: tracks are not
+    /// used.
+    pub track_poses: usize,
+    /// Least time between two of them, s.
+    pub track_spacing: f64,
     /// Most rows of tracks, after elimination of their points, in one update.
     pub track_rows: usize,
     /// Probability with which a track that fits the model is taken for improbable (chi-square of
@@ -94,6 +99,8 @@ impl Default for FilterConfig {
             state_points: 100,
             state_min_observations: 5,
             state_max_unseen_frames: 5,
+            track_poses: 10,
+            track_spacing: 0.1,
             track_rows: 150,
             track_false_alarm: 1e-3,
             velocity_sd: 0.1,
