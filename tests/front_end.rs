@@ -49,7 +49,7 @@ fn load(color: &Path, depth: &Path, scale: f32, stamp: Stamp) -> RgbdFrame {
     let valid = |&raw: &u16| if raw == u16::MAX { 0 } else { raw };
     let values = image.data_typed::<u16>().unwrap().iter().map(valid).collect();
     let depth = DepthImage::new(image.cols() as usize, image.rows() as usize, scale, values);
-    RgbdFrame { stamp, color, depth: depth.unwrap() }
+    RgbdFrame { stamp, color, depth: depth.unwrap(), others: Vec::new() }
 }
 
 /// Rows of a TUM text file: stamp and the rest.

@@ -19,12 +19,11 @@ use super::tables;
 use crate::config::Resolved;
 use crate::dataset::Fault;
 use crate::evaluation::Trajectory;
-use crate::filter::{FilterKind, MapTreatment};
+use crate::filter::FilterKind;
 use crate::inertial::{block, pose_covariance};
 use crate::odometry::{NoteLevel, StepReport};
 use crate::replay::{LogEntry, Observer, Replayed, Request, replay};
 use crate::sensor::RgbdFrame;
-use crate::vision::OrbExtractor;
 
 /// Sees what goes on.
 pub trait Progress {
@@ -237,15 +236,10 @@ impl Part<'_> {
         let filter = self.run.filter.parse::<FilterKind>();
         let filter =
             filter.map_err(|reason| BenchError::Format { path: self.log.to_owned(), reason })?;
-        let seeks =
-            config.search.seek_state_points && filter.map_treatment() == MapTreatment::Correlated;
-        let front_end = OrbExtractor::new(&config.features, &config.camera, &config.depth);
-        let mut front_end = front_end
-            .map_err(|error| BenchError::Format {
-                path: self.log.to_owned(),
-                reason: error.to_string(),
-            })?
-            .keeping_pyramid(seeks);
+        let mut front_end = config.front_end(filter).map_err(|error| BenchError::Format {
+            path: self.log.to_owned(),
+            reason: error.to_string(),
+        })?;
         let faults = self.faults.iter().filter_map(|fault| fault.parse().ok()).collect();
         progress.begin(&self.run.label(), done, planned, summary.frames);
         let request = Request {

@@ -7,7 +7,7 @@ use nalgebra::Isometry3;
 use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::config::{Config, Origin, Resolved};
 use mfg_vio::dataset::{Fault, LogSummary};
-use mfg_vio::filter::{FilterKind, MapTreatment};
+use mfg_vio::filter::FilterKind;
 use mfg_vio::odometry::{InitMode, StepReport};
 use mfg_vio::replay::{Metrics, Observer, Replayed, Request, replay};
 use mfg_vio::sensor::RgbdFrame;
@@ -16,7 +16,6 @@ use mfg_vio::sensor::{Camera, ImuSample};
 use mfg_vio::viewer::{Contents, Purpose};
 #[cfg(feature = "viewer")]
 use mfg_vio::viewer::{Recorder, Sink};
-use mfg_vio::vision::OrbExtractor;
 
 /// Run the estimator over a log of RGB-D frames and IMU samples.
 ///
@@ -210,12 +209,7 @@ impl Plan<'_> {
             std::fs::create_dir_all(out).with_context(|| format!("{}", out.display()))?;
         }
         let filter = self.settings.filter;
-        let seeks = self.config.search.seek_state_points
-            && filter.map_treatment() == MapTreatment::Correlated;
-        let config = &self.config;
-        let mut front_end = OrbExtractor::new(&config.features, &config.camera, &config.depth)?
-            .keeping_pyramid(seeks)
-            .masked(config.log.mask.load()?);
+        let mut front_end = self.config.front_end(filter)?;
         let contents = Contents {
             name: format!("{}, {}, seed {}", self.log.display(), filter, self.settings.seed),
             truth: self.truth.is_some() || self.summary.has_truth,

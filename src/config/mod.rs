@@ -4,6 +4,8 @@
 //! the log's layout, what the log tells of its sensors, a given file, the command line. Each value
 //! knows its [`Origin`].
 
+#[cfg(feature = "vision")]
+mod front_end;
 mod resolve;
 
 pub mod import;
@@ -24,7 +26,9 @@ use crate::odometry::{HealthConfig, InitConfig, OdometryConfig, TruthConfig};
 use crate::sensor::{Camera, CameraConfig, CameraError};
 use crate::tracking::SearchConfig;
 use crate::viewer::RecordingConfig;
-use crate::vision::{DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig};
+use crate::vision::{
+    DepthConfig, FeatureConfig, MatchingConfig, PatchConfig, RansacConfig, TrackerConfig,
+};
 
 pub use resolve::{Conflict, Origin, Resolved, Setting};
 
@@ -40,6 +44,7 @@ pub struct Config {
     pub search: SearchConfig,
     pub matching: MatchingConfig,
     pub patch: PatchConfig,
+    pub tracker: TrackerConfig,
     pub ransac: RansacConfig,
     pub map: MapConfig,
     pub filter: FilterConfig,

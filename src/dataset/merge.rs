@@ -446,7 +446,7 @@ fn registered(
         report.skip("frame: color and depth differ in size", detail);
         return None;
     }
-    Some(RgbdFrame { stamp, color, depth })
+    Some(RgbdFrame { stamp, color, depth, others: Vec::new() })
 }
 
 #[cfg(test)]

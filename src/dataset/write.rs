@@ -363,7 +363,7 @@ mod tests {
     fn frame() -> RgbdFrame {
         let color = ColorImage::new(2, 1, PixelFormat::Rgb8, vec![1, 2, 3, 4, 5, 6]).unwrap();
         let depth = DepthImage::new(2, 1, 0.0002, vec![5000, 0]).unwrap();
-        RgbdFrame { stamp: Stamp::from_parts(12, 5), color, depth }
+        RgbdFrame { stamp: Stamp::from_parts(12, 5), color, depth, others: Vec::new() }
     }
 
     fn written(options: LogWriterOptions) -> Vec<(String, String, Vec<u8>)> {

@@ -204,7 +204,7 @@ fn frame(camera: &Camera, stamp: Stamp, features: usize, shift: f64, depth: f64)
     let color = ColorImage::new(8, 8, PixelFormat::Rgb8, vec![0; 192]).unwrap();
     let depth = DepthImage::new(8, 8, 0.001, vec![0; 64]).unwrap();
     FrontEndFrame {
-        frame: Box::new(RgbdFrame { stamp, color, depth }),
+        frame: Box::new(RgbdFrame { stamp, color, depth, others: Vec::new() }),
         extraction: Extraction { features, ..Extraction::default() },
         seconds: 0.0,
     }

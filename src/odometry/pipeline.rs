@@ -452,7 +452,7 @@ mod tests {
     fn frame(seconds: f64) -> FrontEndFrame {
         let color = ColorImage::new(8, 8, PixelFormat::Rgb8, vec![0; 192]).unwrap();
         let depth = DepthImage::new(8, 8, 0.001, vec![0; 64]).unwrap();
-        let frame = Box::new(RgbdFrame { stamp: at(seconds), color, depth });
+        let frame = Box::new(RgbdFrame { stamp: at(seconds), color, depth, others: Vec::new() });
         FrontEndFrame { frame, extraction: Extraction::default(), seconds: 0.0 }
     }
 

@@ -26,7 +26,11 @@ pub trait FrontEnd: Send {
 }
 
 #[cfg(feature = "vision")]
-impl FrontEnd for crate::vision::OrbExtractor {
+impl FrontEnd for crate::vision::VisualFrontEnd {
+    fn imu(&mut self, sample: &ImuSample) {
+        self.imu(sample);
+    }
+
     fn features(&mut self, frame: &RgbdFrame) -> Result<Extraction, String> {
         self.extract(frame).map_err(|error| error.to_string())
     }

@@ -128,7 +128,7 @@ impl World {
         let color = ColorImage::new(640, 480, PixelFormat::Mono8, vec![0; 640 * 480]).unwrap();
         let depth = DepthImage::new(8, 8, 0.001, vec![0; 64]).unwrap();
         FrontEndFrame {
-            frame: Box::new(RgbdFrame { stamp: at(t), color, depth }),
+            frame: Box::new(RgbdFrame { stamp: at(t), color, depth, others: Vec::new() }),
             extraction: Extraction { tracks, ..Extraction::default() },
             seconds: 0.0,
         }

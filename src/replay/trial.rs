@@ -8,7 +8,6 @@ use crate::config::{Config, ConfigError, Resolved};
 use crate::dataset::{Assumed, Inspection, TURN_SPAN, Trial};
 use crate::filter::FilterKind;
 use crate::sensor::TruthPose;
-use crate::vision::OrbExtractor;
 
 /// Length of the part of the log that the estimator is started on, s.
 const TRIAL_SPAN: f64 = 5.0;
@@ -86,16 +85,13 @@ fn start(log: &Path, config: Config, settings: Vec<String>) -> Trial {
 
 fn run(log: &Path, config: Config, (start, duration): (f64, f64)) -> Result<Replayed, ReplayError> {
     let failed = |error: &dyn std::fmt::Display| ReplayError::FrontEnd(error.to_string());
-    let mask = config.log.mask.load().map_err(|error| failed(&error))?;
-    let mut front_end = OrbExtractor::new(&config.features, &config.camera, &config.depth)
-        .map_err(|error| failed(&error))?
-        .keeping_pyramid(config.search.seek_state_points)
-        .masked(mask);
+    let kind = FilterKind::default();
+    let mut front_end = config.front_end(kind).map_err(|error| failed(&error))?;
     let request = Request {
         log: log.to_owned(),
         config,
         config_origin: String::new(),
-        filter: FilterKind::default(),
+        filter: kind,
         seed: 1,
         // All on this thread, whose messages the caller may silence.
         threads: 1,

@@ -7,4 +7,7 @@ pub struct RgbdFrame {
     pub stamp: Stamp,
     pub color: ColorImage,
     pub depth: DepthImage,
+    /// What further cameras showed at the same time, as taken, by their index less one; empty where
+    /// there are none.
+    pub others: Vec<ColorImage>,
 }

@@ -181,7 +181,7 @@ impl Simulation {
         let (color, depth) = self.renderer.render(&shot)?;
         // `time_offset` is added by the reader to get the IMU's clock, so it is taken off here.
         let stamp = stamp.offset_by(-self.config.camera.time_offset);
-        Some(RgbdFrame { stamp, color, depth })
+        Some(RgbdFrame { stamp, color, depth, others: Vec::new() })
     }
 }
 

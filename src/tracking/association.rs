@@ -238,7 +238,12 @@ mod tests {
         let color = ColorImage::new(SIZE.0, SIZE.1, PixelFormat::Mono8, grey).unwrap();
         let depth = DepthImage::new(SIZE.0, SIZE.1, 1e-4, depths).unwrap();
         FrontEndFrame {
-            frame: Box::new(RgbdFrame { stamp: Stamp::default(), color, depth }),
+            frame: Box::new(RgbdFrame {
+                stamp: Stamp::default(),
+                color,
+                depth,
+                others: Vec::new(),
+            }),
             extraction: Extraction { pyramid, ..Extraction::default() },
             seconds: 0.0,
         }

@@ -198,6 +198,7 @@ impl Walk {
             .collect();
         let depth = pixels().map(|(column, row)| (2000 + 4 * column + 2 * row) as u16).collect();
         RgbdFrame {
+            others: Vec::new(),
             stamp: Self::stamp(frame),
             color: ColorImage::new(width, height, PixelFormat::Bgr8, color).unwrap(),
             depth: DepthImage::new(width, height, 0.001, depth).unwrap(),

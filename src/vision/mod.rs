@@ -5,6 +5,8 @@
 
 mod depth;
 mod feature;
+#[cfg(feature = "vision")]
+mod front_end;
 mod mask;
 mod matching;
 #[cfg(feature = "vision")]
@@ -16,11 +18,14 @@ mod registration;
 #[cfg(feature = "vision")]
 mod select;
 mod stereo;
+mod tracker;
 
 pub use depth::{DepthConfig, DepthReading};
 pub use feature::{
     Descriptor, Extraction, Feature, FeatureConfig, PointMeasurement, TrackedFeature,
 };
+#[cfg(feature = "vision")]
+pub use front_end::VisualFrontEnd;
 pub use mask::{Mask, MaskConfig, MaskError};
 pub use matching::{Match, MatchingConfig, Prediction, match_descriptors, match_guided};
 #[cfg(feature = "vision")]
@@ -30,3 +35,6 @@ pub use pyramid::{Glimpse, Pyramid};
 pub use ransac::{Correspondence, RansacConfig, agree_near, agreeing, estimate_pose};
 pub use registration::DepthRegistration;
 pub use stereo::{StereoError, StereoRig, rectified_camera};
+#[cfg(feature = "vision")]
+pub use tracker::Tracker;
+pub use tracker::TrackerConfig;

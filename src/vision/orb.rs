@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use nalgebra::{Point2, Vector2};
 use opencv::boxed_ref::BoxedRef;
-use opencv::core::{KeyPoint, Mat, Ptr, Rect, Size, Vec3b, Vector};
+use opencv::core::{KeyPoint, Mat, Ptr, Rect, Size, Vector};
 use opencv::features2d::{
     FastFeatureDetector, FastFeatureDetector_DetectorType, KeyPointsFilter, ORB, ORB_ScoreType,
 };
@@ -13,8 +13,11 @@ use opencv::prelude::*;
 
 use super::pyramid::full_pixel;
 use super::select::{Corner, spread};
-use super::{DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Mask, Patch, Pyramid};
-use crate::sensor::{Camera, CameraConfig, CameraError, PixelFormat, RgbdFrame};
+use super::tracker::make_grey;
+use super::{
+    DepthConfig, Descriptor, Extraction, Feature, FeatureConfig, Mask, MaskError, Patch, Pyramid,
+};
+use crate::sensor::{Camera, CameraConfig, CameraError, RgbdFrame};
 
 /// Radius of the patch that orientation and descriptor are computed from, pixels of the level.
 const PATCH_RADIUS: usize = 15;
@@ -60,6 +63,10 @@ pub enum VisionError {
     MaskSize { mask: (usize, usize), color: (usize, usize) },
     #[error("features.{key} = {value}: must be {expected}")]
     Config { key: &'static str, value: f64, expected: &'static str },
+    #[error("tracker.{key} = {value}: must be {expected}")]
+    Tracker { key: &'static str, value: f64, expected: &'static str },
+    #[error(transparent)]
+    Mask(#[from] MaskError),
     #[error("camera.{0}")]
     Camera(#[from] CameraError),
     #[error("OpenCV: {0}")]
@@ -185,7 +192,9 @@ impl OrbExtractor {
     /// The grey image and its reductions, as far as a patch fits into them.
     fn pyramid(&self, frame: &RgbdFrame) -> Result<Vec<Mat>, VisionError> {
         let (width, height) = (frame.color.width(), frame.color.height());
-        let mut levels = vec![grey(frame)?];
+        let mut full = Mat::default();
+        make_grey(&frame.color, &mut full)?;
+        let mut levels = vec![full];
         for level in 1..self.config.levels {
             let scale = self.config.scale_factor.powi(i32::from(level));
             let size = |full: usize| (full as f64 / scale).round() as i32;
@@ -325,23 +334,6 @@ fn check(
     if good { Ok(()) } else { Err(VisionError::Config { key, value, expected }) }
 }
 
-/// Grey copy of the color image.
-fn grey(frame: &RgbdFrame) -> Result<Mat, VisionError> {
-    let (rows, columns) = (frame.color.height() as i32, frame.color.width() as i32);
-    let data = frame.color.data();
-    let code = match frame.color.format() {
-        PixelFormat::Mono8 => {
-            return Ok(Mat::new_rows_cols_with_bytes::<u8>(rows, columns, data)?.try_clone()?);
-        }
-        PixelFormat::Rgb8 => imgproc::COLOR_RGB2GRAY,
-        PixelFormat::Bgr8 => imgproc::COLOR_BGR2GRAY,
-    };
-    let color = Mat::new_rows_cols_with_bytes::<Vec3b>(rows, columns, data)?;
-    let mut grey = Mat::default();
-    imgproc::cvt_color_def(&color, &mut grey, code)?;
-    Ok(grey)
-}
-
 fn patch_around(pyramid: &[Mat], corner: &Corner) -> Result<Option<Arc<Patch>>, VisionError> {
     let Some(level) = pyramid.get(usize::from(corner.level)) else { return Ok(None) };
     let patch = Patch::cut(level.data_bytes()?, level.cols() as usize, corner.column, corner.row);
@@ -372,7 +364,7 @@ fn orientation(pixels: &[u8], stride: usize, corner: &Corner) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sensor::{ColorImage, DepthImage, Stamp};
+    use crate::sensor::{ColorImage, DepthImage, PixelFormat, Stamp};
     use crate::vision::{MaskConfig, MatchingConfig, match_descriptors};
     use opencv::calib3d;
     use opencv::core::{Point2d, TermCriteria, TermCriteria_Type};
@@ -393,6 +385,7 @@ mod tests {
 
     fn frame(width: usize, height: usize, grey: Vec<u8>) -> RgbdFrame {
         RgbdFrame {
+            others: Vec::new(),
             stamp: Stamp::default(),
             color: ColorImage::new(width, height, PixelFormat::Mono8, grey).unwrap(),
             depth: DepthImage::new(width, height, 1e-3, vec![2000; width * height]).unwrap(),
