@@ -6,12 +6,12 @@ use std::collections::BTreeSet;
 use nalgebra::{Isometry3, Matrix3, Translation3, Vector3};
 
 use super::state_points::renew_state_points;
+use super::track_window::{TrackFrame, TrackWindow};
 use super::window::ImuWindow;
 use crate::alignment::PointPair;
 use crate::filter::{
     FilterConfig, FilterError, FilterKind, FrameChange, InertialStep, MapEstimate, MapTreatment,
-    MountedCamera, PointObservation, PointUpdate, Track, TrackUpdate, VisualInertialFilter,
-    ZeroVelocity,
+    PointObservation, PointUpdate, TrackUpdate, VisualInertialFilter, ZeroVelocity,
 };
 use crate::inertial::Belief;
 use crate::map::{Map, MapConfig, Sighting};
@@ -207,16 +207,17 @@ impl BackEnd {
         Ok(change)
     }
 
-    /// Conditions the belief on tracks of points seen from past poses.
+    /// Conditions the belief on what tracks showed to the poses of the window; `None` if nothing of it
+    /// was due.
     pub fn update_tracks(
         &mut self,
-        tracks: &[Track],
-        cameras: &[MountedCamera],
-    ) -> Result<TrackUpdate, FilterError> {
-        let name = self.filter.cannot_use("tracks");
-        let window = self.filter.pose_window_mut().ok_or(name)?;
-        let update = window.update_tracks(tracks, cameras)?;
-        self.follow(&update.frame);
+        tracks: &mut TrackWindow,
+        frame: &TrackFrame<'_>,
+    ) -> Result<Option<TrackUpdate>, FilterError> {
+        let update = tracks.update(self.filter.as_mut(), frame)?;
+        if let Some(update) = &update {
+            self.follow(&update.frame);
+        }
         Ok(update)
     }
 

@@ -237,7 +237,7 @@ impl Odometry {
         run.refine_tracks(&mut tracks, front, &mut view, &prediction);
 
         let update = run.update(&tracks, &view);
-        run.use_followed(front, &tracks, &view, time);
+        let followed = run.use_followed(front, &tracks, &view, time);
         let seen = FrameEvidence {
             stamp: time,
             expected: std::mem::replace(&mut run.expects_matches, true),
@@ -245,6 +245,8 @@ impl Odometry {
             features: detected.features,
             tracks: &tracks,
             update: update.as_ref(),
+            followed: followed.as_ref(),
+            is_followed: run.track_window.connected() >= config.ransac.min_inliers,
         };
         stats.count(&seen, &window);
         run.watch(&seen, &view, supervisor, config);

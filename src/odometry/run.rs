@@ -10,12 +10,11 @@ use super::report::{KeypointRole, KeypointView, Note, StageTimes, StepCounts, St
 use super::rest::RestDetector;
 use super::restart::Spread;
 use super::supervisor::{FrameEvidence, PoseVerdict, Supervisor};
-use super::track_window::{FrameSights, PointSight, TrackWindow};
+use super::track_window::{TrackFrame, TrackWindow};
 use super::window::{ImuCursor, ImuWindow};
 use crate::fault::Obstruction;
 use crate::filter::{
-    Calibration, FilterConfig, MountedCamera, PointObservation, PointUpdate, TrackDepth,
-    TrackUpdate,
+    Calibration, FilterConfig, MountedCamera, PointObservation, PointUpdate, TrackUpdate,
 };
 use crate::inertial::{Belief, NavCovariance};
 use crate::map::{ReferenceView, Sighting};
@@ -24,7 +23,7 @@ use crate::so3::ProperSvd;
 use crate::tracking::{
     FrameTracker, FrontEndFrame, Prediction, Tracks, View, first_reference, in_body, reference,
 };
-use crate::vision::{Feature, PATCH_RADIUS, TrackedFeature};
+use crate::vision::Feature;
 
 /// What exists once the filter has started.
 pub(super) struct Run {
@@ -126,10 +125,10 @@ impl Run {
             PoseVerdict::Unconfirmed => tracks.without_pose(),
             PoseVerdict::Kidnapped => {
                 let way = self.belief().state.world_from_body.inv_mul(&world_from_body);
+                self.track_window.reset(self.back_end.filter_mut());
                 if let Some(points) = self.back_end.filter_mut().point_state_mut() {
                     points.reset_pose(&way, &spread_of_recognition(filter));
                 }
-                self.track_window.clear(&mut self.back_end);
                 supervisor.observe_kidnapping(stamp);
                 prediction.belief = *self.belief();
                 view.shutter = prediction.shutter(view.config, view.size.1, None);
@@ -177,7 +176,8 @@ impl Run {
         updated.inspect_err(|error| tracing::debug!("no update: {error}")).ok()
     }
 
-    /// Conditions the belief on points that were followed through past poses.
+    /// Conditions the belief on points that were followed through past poses; `None` if nothing of it
+    /// was due, or it was refused.
     pub fn use_followed(
         &mut self,
         front: &FrontEndFrame,
@@ -185,15 +185,19 @@ impl Run {
         view: &View,
         time: Stamp,
     ) -> Option<TrackUpdate> {
-        let seen = FrameSights {
+        let features = &front.extraction.features;
+        let measured: Vec<_> =
+            tracks.agreeing().filter_map(|m| Some(features.get(m.feature)?.pixel)).collect();
+        let body_from_camera = self.body_from_camera();
+        let frame = TrackFrame {
             time,
-            points: sights(front, tracks, view),
-            cameras: vec![MountedCamera {
-                camera: *view.camera,
-                body_from_camera: view.body_from_camera,
-            }],
+            seen: &front.extraction.tracks,
+            measured: &measured,
+            cameras: &[MountedCamera { camera: *view.camera, body_from_camera }],
+            view,
         };
-        self.track_window.advance(&mut self.back_end, &seen)
+        let updated = self.back_end.update_tracks(&mut self.track_window, &frame);
+        updated.inspect_err(|error| tracing::debug!("no use of tracks: {error}")).ok()?
     }
 
     /// Compares the turns that the images and the gyroscope see. Gives how much the clocks turn out
@@ -229,10 +233,10 @@ impl Run {
         if supervisor.observe_update(seen, self.belief()) {
             self.levelling.reopen(self.back_end.filter_mut(), stamp, &config.imu);
         }
-        let contradicted = seen.update.is_some_and(PointUpdate::contradicts);
-        self.levelling.weigh(self.back_end.belief(), contradicted, &config.imu);
+        self.levelling.weigh(self.back_end.belief(), seen.contradicts(), &config.imu);
         supervisor.observe_world_turn(seen.update.and_then(|update| update.frame.world_turn));
-        supervisor.judge_belief(stamp, self.belief(), seen.update.map(|update| update.nis));
+        supervisor.observe_world_turn(seen.followed.and_then(|update| update.frame.world_turn));
+        supervisor.judge_belief(stamp, self.belief(), seen.nis());
         self.seeing_frames += u64::from(!supervisor.is_lost());
         if self.gives_up_map(seen.visible, seen.update.is_some(), config.map.max_unseen_frames) {
             supervisor.observe_map_loss(stamp);
@@ -393,39 +397,6 @@ impl Run {
         let reported = Belief { state, covariance: self.reported_covariance() };
         reported.attitude().map(|attitude| *attitude.svd())
     }
-}
-
-/// What a frame shows of followed points that it does not measure as points of the map, too: the same
-/// grey values must not count twice.
-fn sights(front: &FrontEndFrame, tracks: &Tracks, view: &View) -> Vec<PointSight> {
-    let features = &front.extraction.features;
-    let measured: Vec<_> = tracks.agreeing().map(|m| features[m.feature].pixel).collect();
-    let is_apart = |pixel: &Point2<f64>| {
-        measured.iter().all(|other| (pixel - other).amax() > PATCH_RADIUS as f64)
-    };
-    let followed = front.extraction.tracks.iter().filter(|seen| seen.camera == 0);
-    followed.filter(|seen| is_apart(&seen.pixel)).filter_map(|seen| sight(seen, view)).collect()
-}
-
-/// Of a point without depth what its direction does while rows are exposed is known, but not what its
-/// distance adds.
-fn sight(seen: &TrackedFeature, view: &View) -> Option<PointSight> {
-    /// m.
-    const FAR: f64 = 1e3;
-    let depth = seen.depth.map_or(FAR, |reading| reading.depth);
-    let point = view.camera.unproject(seen.pixel, depth)?;
-    let pixel = match view.shutter.is_rolling() {
-        true => view.camera.project(&view.shutter.at_stamp(&point, view.row(seen.pixel)))?,
-        false => seen.pixel,
-    };
-    // What a depth image gets wrong of a point it gets wrong in all views of it.
-    let depth = seen.depth.map(|reading| TrackDepth {
-        depth: reading.depth,
-        variance: 0.0,
-        common_variance: reading.standard_deviation.powi(2),
-    });
-    let (id, camera, pixel_covariance) = (seen.id, seen.camera, seen.pixel_covariance);
-    Some(PointSight { id, camera, pixel, pixel_covariance, depth })
 }
 
 fn observation(

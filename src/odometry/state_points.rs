@@ -23,7 +23,7 @@ pub fn renew_state_points(
 
     let mut unseen: Vec<_> = held
         .iter()
-        .map(|&id| (map.get(id).map_or(0, |point| point.last_seen), id))
+        .filter_map(|&id| Some((map.get(id)?.last_seen, id)))
         .filter(|(last_seen, _)| last_seen + config.state_max_unseen_frames < frame)
         .collect();
     unseen.sort_unstable();

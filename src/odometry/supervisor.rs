@@ -8,7 +8,7 @@ use super::recognition::confirms;
 use super::report::Note;
 use super::window::ImuWindow;
 use crate::fault::{Divergence, Episode, FaultConfig, Monitors, PoseStep, Region, Trust};
-use crate::filter::PointUpdate;
+use crate::filter::{PointUpdate, TrackUpdate};
 use crate::inertial::{Belief, ImuConfig};
 use crate::sensor::{ImuSample, Stamp, Stream};
 use crate::tracking::{InView, Tracks};
@@ -34,6 +34,24 @@ pub(super) struct FrameEvidence<'a> {
     pub features: usize,
     pub tracks: &'a Tracks,
     pub update: Option<&'a PointUpdate>,
+    /// What points told that were followed through past poses.
+    pub followed: Option<&'a TrackUpdate>,
+    /// Whether enough of them tie the frame to such a pose.
+    pub is_followed: bool,
+}
+
+impl FrameEvidence<'_> {
+    /// Whether what was seen contradicts the prediction.
+    pub fn contradicts(&self) -> bool {
+        self.update.is_some_and(PointUpdate::contradicts)
+            || self.followed.is_some_and(|followed| followed.contradicted)
+    }
+
+    /// The normalised innovation squared of what was seen: of the map, if that was.
+    pub fn nis(&self) -> Option<f64> {
+        let followed = self.followed.filter(|followed| followed.rows > 0);
+        self.update.map(|update| update.nis).or(followed.map(|followed| followed.nis))
+    }
 }
 
 /// Whether the pose that a frame's matches agree on is to be believed.
@@ -198,10 +216,10 @@ impl Supervisor {
 
     /// Judges sight, agreement and biases after an update. True if the levelling is to be doubted.
     pub fn observe_update(&mut self, evidence: &FrameEvidence, belief: &Belief) -> bool {
-        let FrameEvidence { stamp, tracks, update, .. } = *evidence;
+        let FrameEvidence { stamp, tracks, .. } = *evidence;
         let (matches, inliers) = (tracks.matches.len(), tracks.inliers.len());
         self.monitors.tracks(stamp, matches, inliers, tracks.second_motion);
-        if update.is_some_and(PointUpdate::contradicts) {
+        if evidence.contradicts() {
             self.monitors.contradicted(stamp);
         }
         // Without an IMU the biases carry the motion of the constant-velocity model.
@@ -220,7 +238,7 @@ impl Supervisor {
             features: evidence.features,
             matches: evidence.tracks.matches.len(),
             inliers: evidence.tracks.inliers.len(),
-            updated: evidence.update.is_some(),
+            updated: evidence.update.is_some() || evidence.is_followed,
         };
         self.notes.extend(self.health.see(evidence.stamp, sight));
     }

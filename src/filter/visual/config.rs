@@ -51,11 +51,16 @@ pub struct FilterConfig {
     pub state_min_observations: u32,
     /// Points of the state not seen for more than this many frames make room for others.
     pub state_max_unseen_frames: u64,
-    /// Past poses that `mfgs`, `iekfs` and `mekfs` keep in their state for tracks; 0: tracks are not
-    /// used.
+    /// Past poses that `mfgs`, `iekfs` and `mekfs` keep in their state for tracks; below 2 tracks are
+    /// not used.
     pub track_poses: usize,
-    /// Least time between two of them, s.
-    pub track_spacing: f64,
+    /// A pose is kept where tracks have moved by so much, in the median, since the last one that was,
+    /// pixels.
+    pub track_shift: f64,
+    /// Or after this time, s.
+    pub track_interval: f64,
+    /// Most points of tracks in the state; they take slots of `state_points` that the map leaves free.
+    pub track_points: usize,
     /// Most rows of tracks, after elimination of their points, in one update.
     pub track_rows: usize,
     /// Probability with which a track that fits the model is taken for improbable (chi-square of
@@ -100,7 +105,9 @@ impl Default for FilterConfig {
             state_min_observations: 5,
             state_max_unseen_frames: 5,
             track_poses: 10,
-            track_spacing: 0.1,
+            track_shift: 10.0,
+            track_interval: 0.25,
+            track_points: 30,
             track_rows: 150,
             track_false_alarm: 1e-3,
             velocity_sd: 0.1,
