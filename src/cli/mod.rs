@@ -14,6 +14,7 @@ mod faults;
 mod files;
 mod fisher;
 mod gnss;
+mod imu_noise;
 mod info;
 #[cfg(feature = "vision")]
 mod replay;
@@ -57,6 +58,7 @@ enum Command {
     Experiment(experiment::ExperimentArgs),
     Fisher(fisher::FisherArgs),
     Gnss(gnss::GnssArgs),
+    ImuNoise(imu_noise::Args),
 }
 
 /// The command line contradicts itself in a way that its grammar does not tell.
@@ -123,6 +125,7 @@ fn run(command: Command) -> anyhow::Result<()> {
         Command::Experiment(args) => experiment::run(&args),
         Command::Fisher(args) => fisher::run(&args),
         Command::Gnss(args) => gnss::run(&args),
+        Command::ImuNoise(args) => imu_noise::run(&args),
     }
 }
 

@@ -16,6 +16,7 @@ mod figures;
 mod golden;
 mod guards;
 mod nees;
+mod noise_figure;
 mod plot;
 mod relative;
 mod report;
@@ -41,6 +42,7 @@ pub use nees::{
     BelievedTrajectory, NeesOptions, NeesResult, NeesSummary, nees, normalised_square,
     read_believed_trajectory,
 };
+pub use noise_figure::noise_figure;
 pub use plot::{Band, BoxPanel, Curve, CurvePanel, Figure, Panel, PathPanel, PlotError, Scale};
 pub use relative::{Delta, RpeOptions, RpeResult, rpe};
 pub use report::{Report, write_html};

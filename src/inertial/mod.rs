@@ -4,6 +4,7 @@
 mod clipping;
 mod coverage;
 mod directions;
+pub mod identification;
 mod imu;
 mod initial;
 mod noise;

@@ -127,7 +127,7 @@ pub fn replay_attitude(
     request: &AttitudeRequest,
     mut progress: impl FnMut(),
 ) -> Result<AttitudeMetrics, ReplayError> {
-    let (rows, config) = open(request)?;
+    let (rows, config) = request.inertial().open()?;
     let mut output = request.out.as_deref().map(create).transpose()?;
     let mut metrics = AttitudeMetrics {
         log: request.log.display().to_string(),
@@ -233,39 +233,67 @@ fn finish(output: Option<OutputFile>) -> Result<(), ReplayError> {
     output.map_or(Ok(()), OutputFile::finish)
 }
 
-type Rows = Box<dyn Iterator<Item = Result<ImuRow, LogError>>>;
+pub(super) type Rows = Box<dyn Iterator<Item = Result<ImuRow, LogError>>>;
 
-/// The samples of a log with an IMU, or else of a CSV file, in SI units, and the settings.
-fn open(request: &AttitudeRequest) -> Result<(Rows, AdaptiveConfig), ReplayError> {
-    let path = &request.log;
-    let summary = match dataset::detect(path) {
-        Ok(summary) => Some(summary),
-        Err(LogError::UnknownFormat { .. }) if path.is_file() => None,
-        Err(error) => return Err(error.into()),
-    };
-    let config = configuration(request, summary.as_ref())?;
-    let Some(summary) = summary else {
-        let imu = config.imu.clone();
-        let rows = ImuCsv::open(path)?
-            .map(move |row| row.map(|row| ImuRow { imu: imu.in_si_units(&row.imu), ..row }));
-        return Ok((Box::new(rows), config));
-    };
-    let topics = NavigationTopics {
-        imu: request.topic.clone().unwrap_or_default(),
-        gnss: "none".to_owned(),
-        magnetic: String::new(),
-    };
-    let log = read_navigation(path, &topics, &config.imu)?;
-    if log.imu.is_empty() {
-        let available = summary.sources.values().cloned().collect::<Vec<_>>().join(", ");
-        let role = "IMU";
-        return Err(LogError::MissingStream { path: path.to_owned(), role, available }.into());
+/// A log of which the inertial and magnetic data are wanted, and how they are read.
+#[derive(Debug, Clone, Copy)]
+pub struct InertialInput<'a> {
+    pub log: &'a Path,
+    /// Configuration file [default: `configs/attitude.toml`, units by the log's layout].
+    pub config: Option<&'a Path>,
+    /// `section.key=value`.
+    pub overrides: &'a [String],
+    /// Of the IMU; `None`: chosen by message type.
+    pub topic: Option<&'a str>,
+}
+
+impl AttitudeRequest<'_> {
+    fn inertial(&self) -> InertialInput<'_> {
+        InertialInput {
+            log: &self.log,
+            config: self.config.as_deref(),
+            overrides: &self.overrides,
+            topic: self.topic.as_deref(),
+        }
     }
-    for (role, source) in &log.sources {
-        tracing::info!("{role}: {source}");
+}
+
+impl InertialInput<'_> {
+    /// The samples of a log with an IMU, or else of a CSV file, in SI units, and the settings.
+    ///
+    /// # Errors
+    /// If the log or the configuration cannot be read, or the log has no IMU.
+    pub(super) fn open(&self) -> Result<(Rows, AdaptiveConfig), ReplayError> {
+        let path = self.log;
+        let summary = match dataset::detect(path) {
+            Ok(summary) => Some(summary),
+            Err(LogError::UnknownFormat { .. }) if path.is_file() => None,
+            Err(error) => return Err(error.into()),
+        };
+        let config = configuration(self, summary.as_ref())?;
+        let Some(summary) = summary else {
+            let imu = config.imu.clone();
+            let rows = ImuCsv::open(path)?
+                .map(move |row| row.map(|row| ImuRow { imu: imu.in_si_units(&row.imu), ..row }));
+            return Ok((Box::new(rows), config));
+        };
+        let topics = NavigationTopics {
+            imu: self.topic.unwrap_or_default().to_owned(),
+            gnss: "none".to_owned(),
+            magnetic: String::new(),
+        };
+        let log = read_navigation(path, &topics, &config.imu)?;
+        if log.imu.is_empty() {
+            let available = summary.sources.values().cloned().collect::<Vec<_>>().join(", ");
+            let role = "IMU";
+            return Err(LogError::MissingStream { path: path.to_owned(), role, available }.into());
+        }
+        for (role, source) in &log.sources {
+            tracing::info!("{role}: {source}");
+        }
+        let rows = with_magnetic_field(&log.imu, &log.magnetic);
+        Ok((Box::new(rows.into_iter().map(Ok)), config))
     }
-    let rows = with_magnetic_field(&log.imu, &log.magnetic);
-    Ok((Box::new(rows.into_iter().map(Ok)), config))
 }
 
 /// Gives every sample the last reading of the magnetometer since the sample before.
@@ -283,11 +311,11 @@ fn with_magnetic_field(imu: &[ImuSample], magnetic: &[MagneticSample]) -> Vec<Im
 
 /// That of the file, or the shipped one in the units of the log's layout.
 fn configuration(
-    request: &AttitudeRequest,
+    request: &InertialInput,
     summary: Option<&LogSummary>,
 ) -> Result<AdaptiveConfig, ReplayError> {
-    if let Some(path) = &request.config {
-        return Ok(AdaptiveConfig::load(path, &request.overrides)?);
+    if let Some(path) = request.config {
+        return Ok(AdaptiveConfig::load(path, request.overrides)?);
     }
     let mut overrides = Vec::new();
     if let Some(summary) = summary {

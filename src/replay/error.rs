@@ -3,6 +3,7 @@ use std::path::PathBuf;
 use crate::config::ConfigError;
 use crate::dataset::LogError;
 use crate::evaluation::EvaluationError;
+use crate::inertial::identification::IdentificationError;
 
 /// Why a log could not be replayed.
 #[derive(Debug, thiserror::Error)]
@@ -21,6 +22,8 @@ pub enum ReplayError {
     Config(#[from] ConfigError),
     #[error("{log}: no attitude: {reason}")]
     NoAttitude { log: PathBuf, reason: String },
+    #[error("{log}: {source}")]
+    Noise { log: PathBuf, source: IdentificationError },
     #[error("the front end cannot start: {0}")]
     FrontEnd(String),
     #[error("the recording failed: {0}")]

@@ -4,6 +4,7 @@ mod attitude;
 mod error;
 mod evaluation;
 mod faults;
+mod imu_noise;
 mod metrics;
 mod navigation;
 mod navigation_input;
@@ -20,9 +21,10 @@ use std::time::Instant;
 
 use nalgebra::{Isometry3, Matrix6, UnitQuaternion, Vector3};
 
-pub use attitude::{AttitudeMetrics, AttitudeRequest, Reached, replay_attitude};
+pub use attitude::{AttitudeMetrics, AttitudeRequest, InertialInput, Reached, replay_attitude};
 pub use evaluation::{Consistency, Evaluated, Evaluation, RelativeErrors, evaluate};
 pub use faults::{FaultOutcome, Naming, Recovered, confusion, expected_name, fault_grid};
+pub use imu_noise::{NoiseSettings, inertial_samples, noise_of_log};
 pub use metrics::{LogEntry, Metrics, StageSummary};
 pub use navigation::NavigationOutputs;
 pub use navigation_input::{
