@@ -9,8 +9,8 @@ use statrs::distribution::{ChiSquared, ContinuousCDF};
 use super::association::matches;
 use super::guards::MIN_MATCHES;
 use super::{
-    Alignment, AssociationOptions, EvaluationError, PosePairs, Statistics, Trajectory, align,
-    guards,
+    Alignment, AssociationOptions, EvaluationError, PosePairs, RunBand, Statistics, Trajectory,
+    align, guards,
 };
 
 /// Poses with what the estimator believes of their errors.
@@ -173,6 +173,9 @@ pub struct NeesSummary {
     pub inside: f64,
     /// Fraction of the errors above the band: overconfidence.
     pub above: f64,
+    /// What the mean says, by how much the errors of the run have in common; where they are a run.
+    #[serde(flatten)]
+    pub run: Option<RunBand>,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -248,25 +251,30 @@ pub fn nees(
         let truth = alignment.apply(&reference.poses()[r]);
         series.push(trajectory.stamps()[e], &truth, &trajectory.poses()[e], &covariance(e));
     }
-    let summary = |values: &[f64], dof| {
-        NeesSummary::of(values, dof, confidence).ok_or(EvaluationError::NoCovariance)
+    let squares = |whitened: &[Vector3<f64>]| whitened.iter().map(Vector3::norm_squared).collect();
+    let (Some(attitude), Some(position), Some(joint)) = (
+        NeesSummary::of_run(&series.attitude, confidence),
+        NeesSummary::of_run(&series.position, confidence),
+        NeesSummary::of_run(&series.joint, confidence),
+    ) else {
+        return Err(EvaluationError::NoCovariance);
     };
     Ok(NeesResult {
         matched: indices.len(),
         reference_poses: reference.len(),
         estimate_poses: trajectory.len(),
         singular: indices.len() - series.stamps.len(),
-        attitude: summary(&series.attitude, 3)?,
-        position: summary(&series.position, 3)?,
-        joint: summary(&series.joint, 6)?,
+        attitude,
+        position,
+        joint,
         stamps: series.stamps,
         rotation_errors: series.rotation_errors,
         position_errors: series.position_errors,
         rotation_sigmas: series.rotation_sigmas,
         position_sigmas: series.position_sigmas,
-        attitude_nees: series.attitude,
-        position_nees: series.position,
-        joint_nees: series.joint,
+        attitude_nees: squares(&series.attitude),
+        position_nees: squares(&series.position),
+        joint_nees: series.joint.iter().map(Vector6::norm_squared).collect(),
     })
 }
 
@@ -277,9 +285,10 @@ struct Series {
     position_errors: Vec<Vector3<f64>>,
     rotation_sigmas: Vec<Vector3<f64>>,
     position_sigmas: Vec<Vector3<f64>>,
-    attitude: Vec<f64>,
-    position: Vec<f64>,
-    joint: Vec<f64>,
+    /// In units of the covariances' roots, rotations about the axes of the estimate's world.
+    attitude: Vec<Vector3<f64>>,
+    position: Vec<Vector3<f64>>,
+    joint: Vec<Vector6<f64>>,
 }
 
 impl Series {
@@ -293,14 +302,21 @@ impl Series {
     ) {
         let rotation = (estimate.rotation.inverse() * truth.rotation).scaled_axis();
         let position = truth.translation.vector - estimate.translation.vector;
-        let joint =
-            Vector6::new(rotation.x, rotation.y, rotation.z, position.x, position.y, position.z);
         let rotation_block = covariance.fixed_view::<3, 3>(0, 0).into_owned();
         let position_block = covariance.fixed_view::<3, 3>(3, 3).into_owned();
-        let (Some(attitude_nees), Some(position_nees), Some(joint_nees)) = (
-            normalised_square(&rotation, rotation_block),
-            normalised_square(&position, position_block),
-            normalised_square(&joint, *covariance),
+        // The axes of a body that turns would hide how long an error lasts.
+        let mut turn = Matrix6::identity();
+        let world_from_body = estimate.rotation.to_rotation_matrix().into_inner();
+        turn.fixed_view_mut::<3, 3>(0, 0).copy_from(&world_from_body);
+        let covariance = turn * covariance * turn.transpose();
+        let world_rotation = world_from_body * rotation;
+        let mut joint = Vector6::zeros();
+        joint.fixed_rows_mut::<3>(0).copy_from(&world_rotation);
+        joint.fixed_rows_mut::<3>(3).copy_from(&position);
+        let (Some(attitude), Some(position_whitened), Some(joint)) = (
+            whitened(&world_rotation, covariance.fixed_view::<3, 3>(0, 0).into_owned()),
+            whitened(&position, position_block),
+            whitened(&joint, covariance),
         ) else {
             return;
         };
@@ -309,9 +325,21 @@ impl Series {
         self.position_errors.push(position);
         self.rotation_sigmas.push(rotation_block.diagonal().map(f64::sqrt));
         self.position_sigmas.push(position_block.diagonal().map(f64::sqrt));
-        self.attitude.push(attitude_nees);
-        self.position.push(position_nees);
-        self.joint.push(joint_nees);
+        self.attitude.push(attitude);
+        self.position.push(position_whitened);
+        self.joint.push(joint);
+    }
+}
+
+/// Mean, what it may be, and the share of the run inside the band of a single error.
+impl std::fmt::Display for NeesSummary {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { dof, mean, inside, .. } = self;
+        write!(f, "mean {mean:.1} ({dof} expected")?;
+        if let Some(RunBand { mean_band: [low, high], verdict, .. }) = self.run {
+            write!(f, ", {low:.1} to {high:.1} in a run like this: {}", verdict.name())?;
+        }
+        write!(f, "), {:.0} % of the time inside the band", 100.0 * inside)
     }
 }
 
@@ -320,9 +348,17 @@ pub fn normalised_square<const N: usize>(
     error: &SVector<f64, N>,
     covariance: SMatrix<f64, N, N>,
 ) -> Option<f64> {
+    Some(whitened(error, covariance)?.norm_squared()).filter(|square| square.is_finite())
+}
+
+/// `L^-1 e`, `P = L L^T`; `None` unless `P` is positive definite.
+fn whitened<const N: usize>(
+    error: &SVector<f64, N>,
+    covariance: SMatrix<f64, N, N>,
+) -> Option<SVector<f64, N>> {
     let factor = Cholesky::new(covariance)?;
     let whitened = factor.l().solve_lower_triangular(error)?;
-    Some(whitened.norm_squared()).filter(|square| square.is_finite())
+    whitened.iter().all(|x| x.is_finite()).then_some(whitened)
 }
 
 impl NeesSummary {
@@ -342,7 +378,15 @@ impl NeesSummary {
             band,
             inside: fraction(&|value| band[0] <= value && value <= band[1]),
             above: fraction(&|value| value > band[1]),
+            run: None,
         })
+    }
+
+    /// Of the errors of a run at equal steps, each in units of its covariance's root.
+    fn of_run<const N: usize>(whitened: &[SVector<f64, N>], confidence: f64) -> Option<Self> {
+        let squares: Vec<f64> = whitened.iter().map(SVector::norm_squared).collect();
+        let run = RunBand::of(whitened, confidence);
+        Some(Self { run, ..Self::of(&squares, N, confidence)? })
     }
 }
 

@@ -139,9 +139,11 @@ impl Metrics {
                 rows.push(("RPE RMSE over 1 s", text));
             }
             if let Some(nees) = &evaluation.nees {
-                let (attitude, position) = (nees.attitude.mean, nees.position.mean);
-                let text = format!("{attitude:.1} attitude, {position:.1} position (3 expected)");
-                rows.push(("mean NEES", text));
+                for (name, part) in
+                    [("NEES, attitude", &nees.attitude), ("NEES, position", &nees.position)]
+                {
+                    rows.push((name, part.to_string()));
+                }
             }
         }
         if let Some(reason) = &self.evaluation_failure {
