@@ -7,12 +7,14 @@ use clap::Args;
 use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::dataset::{LogWriter, WriteSummary};
 use mfg_vio::output::Files;
+use mfg_vio::replay::{InertialInput, inertial_samples};
 use mfg_vio::sensor::Event;
-use mfg_vio::simulation::{SceneConfig, Simulation};
+use mfg_vio::simulation::{MeasuredImu, SceneConfig, Simulation};
 
 /// Render an RGB-D + IMU log with ground truth.
 #[derive(Debug, Args)]
-#[command(after_help = "Example:\n  mfg-vio simulate --out lab.mcap --duration 10 --seed 1")]
+#[command(after_help = "Example:\n  mfg-vio simulate --out lab.mcap --duration 10 --seed 1\n  \
+                        mfg-vio simulate --imu flight.bag --trajectory flight.tum --out rendered.mcap")]
 pub struct SimulateArgs {
     /// The log to write (MCAP).
     #[arg(long, value_name = "LOG.mcap")]
@@ -23,6 +25,10 @@ pub struct SimulateArgs {
     /// Move along a recorded trajectory (TUM format, poses of the IMU).
     #[arg(long, value_name = "TUM")]
     trajectory: Option<PathBuf>,
+    /// A log with the IMU that was measured along the trajectory, on its clock (or CSV as for `attitude`):
+    /// its samples take the place of simulated ones, and tell what is up.
+    #[arg(long, value_name = "LOG")]
+    imu: Option<PathBuf>,
     /// Direction that points up in the trajectory's world, or `auto`.
     #[arg(long, value_name = "X,Y,Z", default_value = "auto", allow_hyphen_values = true)]
     up: Up,
@@ -79,7 +85,14 @@ pub fn run(args: SimulateArgs) -> anyhow::Result<()> {
         files.reads("trajectory", &scene.trajectory.file).writes("--out", &args.out).check()?;
     }
     catch_interrupts()?;
-    let summary = render(scene, &args.out)?;
+    let simulation = match &args.imu {
+        Some(log) => {
+            let input = InertialInput { log, config: None, overrides: &[], topic: None };
+            Simulation::with_imu(scene, MeasuredImu::new(inertial_samples(&input)?))?
+        }
+        None => Simulation::new(scene)?,
+    };
+    let summary = write(simulation, &args.out)?;
     print(&format!(
         "{}: {} frames, {} IMU samples, {} truth poses",
         args.out.display(),
@@ -91,7 +104,10 @@ pub fn run(args: SimulateArgs) -> anyhow::Result<()> {
 
 /// Writes the log of a scene; an interrupted one is complete up to there.
 pub fn render(scene: SceneConfig, out: &Path) -> anyhow::Result<WriteSummary> {
-    let simulation = Simulation::new(scene)?;
+    write(Simulation::new(scene)?, out)
+}
+
+fn write(simulation: Simulation, out: &Path) -> anyhow::Result<WriteSummary> {
     let log = LogWriter::create(out, simulation.config().log.clone())?;
     let frames = simulation.config().duration * simulation.config().image.rate;
     let bar = progress(Some(frames as u64 + 1), "simulated frames");

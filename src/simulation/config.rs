@@ -3,6 +3,8 @@ use std::path::{Path, PathBuf};
 use nalgebra::Isometry3;
 use serde::{Deserialize, Serialize};
 
+use super::imperfections::ImperfectionConfig;
+use super::measured::MeasuredImuError;
 use super::motion::MotionConfig;
 use super::render::{DropoutConfig, ImageConfig};
 use super::trajectory::{TrajectoryConfig, TrajectoryError};
@@ -36,6 +38,8 @@ pub struct SceneConfig {
     pub depth: DepthConfig,
     pub dropout: DropoutConfig,
     pub imu: ImuSensorConfig,
+    /// What calibration leaves wrong with the sensors.
+    pub imperfections: ImperfectionConfig,
     pub truth: TruthConfig,
     pub log: LogWriterOptions,
 }
@@ -56,6 +60,7 @@ impl Default for SceneConfig {
             depth: structure_core_depth(),
             dropout: DropoutConfig::default(),
             imu: ImuSensorConfig::default(),
+            imperfections: ImperfectionConfig::default(),
             truth: TruthConfig::default(),
             log: LogWriterOptions::default(),
         }
@@ -167,6 +172,8 @@ pub enum SceneError {
     Camera(#[from] CameraError),
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),
+    #[error(transparent)]
+    Imu(#[from] MeasuredImuError),
 }
 
 impl SceneConfig {
@@ -238,7 +245,7 @@ impl SceneConfig {
             ("image.noise", self.image.noise),
             ("image.shutter", self.image.shutter),
         ];
-        for (key, value) in not_negative {
+        for (key, value) in not_negative.into_iter().chain(self.imperfections.sizes()) {
             let valid = value >= 0.0 && value.is_finite();
             require(valid, key, value, "must be zero or more, and finite")?;
         }

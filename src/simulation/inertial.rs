@@ -4,13 +4,17 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::config::ImuSensorConfig;
+use super::imperfections::{ImperfectionConfig, Imperfections};
 use super::motion::BodyState;
 use crate::sensor::{ImuSample, Stamp};
 
-/// Adds biases and noise to the true motion, sample by sample.
+/// Adds biases, noise and imperfections to the true motion, sample by sample.
 #[derive(Debug, Clone)]
 pub struct ImuSimulator {
     config: ImuSensorConfig,
+    imperfections: Imperfections,
+    /// Of the first reading.
+    start: Option<Stamp>,
     rng: ChaCha8Rng,
     /// rad/s.
     gyro_bias: Vector3<f64>,
@@ -20,11 +24,16 @@ pub struct ImuSimulator {
 }
 
 impl ImuSimulator {
+    /// An IMU without imperfections.
     pub fn new(config: ImuSensorConfig, seed: u64) -> Self {
+        Self::imperfect(config, Imperfections::draw(ImperfectionConfig::default(), seed), seed)
+    }
+
+    pub fn imperfect(config: ImuSensorConfig, imperfections: Imperfections, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let gyro_bias = normal(&mut rng) * config.gyro_bias_sd;
         let accel_bias = normal(&mut rng) * config.accel_bias_sd;
-        Self { config, rng, gyro_bias, accel_bias, last: None }
+        Self { config, imperfections, start: None, rng, gyro_bias, accel_bias, last: None }
     }
 
     /// Biases of the latest sample: gyroscope (rad/s) and accelerometer (m/s^2).
@@ -43,15 +52,21 @@ impl ImuSimulator {
         let per_sample = config.rate.sqrt();
         let gyro_noise = normal(&mut self.rng) * (config.gyro_noise * per_sample);
         let accel_noise = normal(&mut self.rng) * (config.accel_noise * per_sample);
-        ImuSample {
-            stamp,
-            angular_velocity: state.angular_velocity * (1.0 + config.gyro_scale_error)
-                + self.gyro_bias
-                + gyro_noise,
-            specific_force: state.specific_force(config.gravity) * (1.0 + config.accel_scale_error)
-                + self.accel_bias
-                + accel_noise,
-        }
+        let start = *self.start.get_or_insert(stamp);
+        let mut sample = self.imperfections.felt(
+            stamp.seconds_since(start),
+            ImuSample {
+                stamp,
+                angular_velocity: state.angular_velocity,
+                specific_force: state.specific_force(config.gravity),
+            },
+        );
+        sample.angular_velocity =
+            sample.angular_velocity * (1.0 + config.gyro_scale_error) + self.gyro_bias + gyro_noise;
+        sample.specific_force = sample.specific_force * (1.0 + config.accel_scale_error)
+            + self.accel_bias
+            + accel_noise;
+        self.imperfections.quantised(sample)
     }
 }
 

@@ -1,9 +1,11 @@
 //! Worlds, motions and sensors.
 
 mod config;
+mod imperfections;
 mod inertial;
 mod landmarks;
 mod lens;
+mod measured;
 mod motion;
 mod render;
 mod sensors;
@@ -13,8 +15,10 @@ mod trajectory;
 mod world;
 
 pub use config::{ImuSensorConfig, LightConfig, SceneConfig, SceneError, TruthConfig};
+pub use imperfections::{ImperfectionConfig, Imperfections, VibrationConfig};
 pub use inertial::ImuSimulator;
 pub use landmarks::{LandmarkFrame, LandmarkScene, LandmarkSceneConfig, LandmarkSighting};
+pub use measured::{MeasuredImu, MeasuredImuError};
 pub use motion::{BodyState, Motion, MotionConfig, MotionKind};
 pub use render::{DropoutConfig, ImageConfig, Renderer, Shot};
 pub use sensors::Simulation;

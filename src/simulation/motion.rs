@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::trajectory::{Trajectory, TrajectoryConfig, TrajectoryError};
+use crate::sensor::Stamp;
 
 /// Pose and derivatives of the body (IMU) at one instant.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -173,6 +174,14 @@ impl Motion {
         match &self.curve {
             Curve::BuiltIn { .. } => None,
             Curve::Recorded(trajectory) => Some(self.pace.time_of(trajectory.duration())),
+        }
+    }
+
+    /// Stamp of the recording at the start of the path; `None` for built-in motions.
+    pub(super) fn origin(&self) -> Option<Stamp> {
+        match &self.curve {
+            Curve::BuiltIn { .. } => None,
+            Curve::Recorded(trajectory) => Some(trajectory.origin()),
         }
     }
 

@@ -5,10 +5,13 @@ use std::sync::mpsc::sync_channel;
 use nalgebra::{Isometry3, Vector3};
 
 use super::config::{SceneConfig, SceneError};
+use super::imperfections::Imperfections;
 use super::inertial::ImuSimulator;
-use super::motion::{BodyState, Motion};
+use super::measured::{MeasuredImu, MeasuredImuError};
+use super::motion::{BodyState, Motion, MotionConfig};
 use super::render::{Renderer, Shot};
 use super::texture::Picture;
+use super::trajectory::body_poses;
 use super::world::{RoomConfig, World};
 use crate::dataset::{LogWriter, WriteError, WriteSummary};
 use crate::sensor::{Event, RgbdFrame, Stamp, TruthPose};
@@ -20,6 +23,9 @@ pub struct Simulation {
     body_from_camera: Isometry3<f64>,
     renderer: Renderer,
     imu: ImuSimulator,
+    imperfections: Imperfections,
+    /// In place of the simulated IMU.
+    measured: Option<MeasuredImu>,
     start: Stamp,
     imu_samples: Ticks,
     truth_poses: Ticks,
@@ -97,7 +103,8 @@ impl Simulation {
             config.dropout.clone(),
             seed(3),
         );
-        let imu = ImuSimulator::new(config.imu.clone(), seed(4));
+        let imperfections = Imperfections::draw(config.imperfections.clone(), seed(5));
+        let imu = ImuSimulator::imperfect(config.imu.clone(), imperfections.clone(), seed(4));
         let ticks = |rate, gaps| Ticks::new(rate, config.duration, gaps);
         let imu_samples = ticks(config.imu.rate, &config.imu.gaps);
         let truth_poses = ticks(config.truth.rate, &[]);
@@ -108,6 +115,8 @@ impl Simulation {
             body_from_camera,
             renderer,
             imu,
+            imperfections,
+            measured: None,
             start,
             imu_samples,
             truth_poses,
@@ -115,8 +124,36 @@ impl Simulation {
         })
     }
 
+    /// Renders what a camera would have seen along a recorded trajectory on which `imu` was measured,
+    /// on their clock. Where `trajectory.up` is not given, up is where the IMU's mean force points.
+    ///
+    /// # Errors
+    /// [`SceneError::Imu`] if the IMU does not cover the trajectory, or there is none.
+    pub fn with_imu(mut config: SceneConfig, mut imu: MeasuredImu) -> Result<Self, SceneError> {
+        if config.trajectory.file.as_os_str().is_empty() {
+            return Err(MeasuredImuError::NoTrajectory.into());
+        }
+        let body_from_camera = config.validate()?;
+        if config.trajectory.up == [0.0; 3] {
+            let poses = body_poses(&config.trajectory, &body_from_camera)?;
+            config.trajectory.up = imu.up(&poses)?.into();
+        }
+        // As fast as it was recorded, from the first moment on.
+        config.motion = MotionConfig { standstill: 0.0, ramp: 0.0, speed: 1.0, ..config.motion };
+        let mut simulation = Self::new(config)?;
+        simulation.start = simulation.motion.origin().unwrap_or(simulation.start);
+        imu.cut(simulation.start, simulation.start.offset_by(simulation.config.duration))?;
+        simulation.measured = Some(imu);
+        Ok(simulation)
+    }
+
     pub fn config(&self) -> &SceneConfig {
         &self.config
+    }
+
+    /// What is wrong with the sensors.
+    pub fn imperfections(&self) -> &Imperfections {
+        &self.imperfections
     }
 
     /// Stamp of the first sample.
@@ -176,12 +213,27 @@ impl Simulation {
         }
     }
 
+    /// Time of the next sample of the IMU (s), infinite after the last.
+    fn next_sample(&self) -> f64 {
+        match &self.measured {
+            Some(measured) => {
+                measured.next_stamp().map_or(f64::INFINITY, |stamp| stamp.seconds_since(self.start))
+            }
+            None => self.imu_samples.time(),
+        }
+    }
+
     fn frame(&mut self, stamp: Stamp, number: u64) -> Option<RgbdFrame> {
         let shot = self.shot(stamp, number);
         let (color, depth) = self.renderer.render(&shot)?;
-        // `time_offset` is added by the reader to get the IMU's clock, so it is taken off here.
-        let stamp = stamp.offset_by(-self.config.camera.time_offset);
-        Some(RgbdFrame { stamp, color, depth, others: Vec::new() })
+        let stamp = stamp.offset_by(self.camera_clock(number));
+        Some(RgbdFrame { stamp, color, depth: self.imperfections.depth(depth), others: Vec::new() })
+    }
+
+    /// What a frame's stamp is later than its time on the IMU's clock, s. `time_offset` is added by the
+    /// reader to get the IMU's clock, so it is taken off here.
+    fn camera_clock(&self, frame: u64) -> f64 {
+        self.imperfections.stamp_delay(frame) - self.config.camera.time_offset
     }
 }
 
@@ -189,13 +241,16 @@ impl Iterator for Simulation {
     type Item = Event;
 
     fn next(&mut self) -> Option<Event> {
-        let at_camera = self.frames.time() - self.config.camera.time_offset;
-        let (imu, truth) = (self.imu_samples.time(), self.truth_poses.time());
+        let at_camera = self.frames.time() + self.camera_clock(self.frames.next);
+        let (imu, truth) = (self.next_sample(), self.truth_poses.time());
         let earliest = imu.min(truth).min(at_camera);
         if !earliest.is_finite() {
             return None;
         }
         if imu == earliest {
+            if let Some(measured) = &mut self.measured {
+                return measured.take().map(Event::Imu);
+            }
             self.imu_samples.take();
             let stamp = self.start.offset_by(imu);
             let state = self.state(stamp);

@@ -78,6 +78,8 @@ pub(super) struct Trajectory {
     position: Spline<3>,
     /// Quaternion `x y z w`, to be normalised.
     attitude: Spline<4>,
+    /// Stamp of the recording at path time zero.
+    origin: Stamp,
     /// Usable time, s.
     duration: f64,
     /// Time cut off at each end, where the spline has data on one side only, s.
@@ -97,11 +99,7 @@ impl Trajectory {
         config: &TrajectoryConfig,
         body_from_camera: &Isometry3<f64>,
     ) -> Result<Self, TrajectoryError> {
-        let mut poses = read(&config.file)?;
-        if config.of == Carrier::Camera {
-            let camera_from_body = body_from_camera.inverse();
-            poses.iter_mut().for_each(|p| p.world_from_body *= camera_from_body);
-        }
+        let poses = body_poses(config, body_from_camera)?;
         let poses = uninterrupted(config, &poses)?;
         Self::fit(&leveled(config, poses, body_from_camera), config.cutoff).ok_or_else(|| {
             TrajectoryError::Fit { path: config.file.clone(), cutoff: config.cutoff }
@@ -124,6 +122,7 @@ impl Trajectory {
         Some(Self {
             position: Spline::fit(&times, &positions, how(0.004))?,
             attitude: Spline::fit(&times, &quaternions, how(0.006))?,
+            origin: first.offset_by(MARGIN),
             duration: times.last()? - 2.0 * MARGIN,
             margin: MARGIN,
         })
@@ -131,6 +130,10 @@ impl Trajectory {
 
     pub fn duration(&self) -> f64 {
         self.duration
+    }
+
+    pub fn origin(&self) -> Stamp {
+        self.origin
     }
 
     /// State at path time `tau` (s) if that passes at `pace` and `change` (its derivative).
@@ -149,6 +152,19 @@ impl Trajectory {
             angular_velocity: turn.imag() * (2.0 * pace),
         }
     }
+}
+
+/// The poses of the body in the file's world.
+pub(super) fn body_poses(
+    config: &TrajectoryConfig,
+    body_from_camera: &Isometry3<f64>,
+) -> Result<Vec<TruthPose>, TrajectoryError> {
+    let mut poses = read(&config.file)?;
+    if config.of == Carrier::Camera {
+        let camera_from_body = body_from_camera.inverse();
+        poses.iter_mut().for_each(|p| p.world_from_body *= camera_from_body);
+    }
+    Ok(poses)
 }
 
 fn read(path: &Path) -> Result<Vec<TruthPose>, TrajectoryError> {
