@@ -245,8 +245,7 @@ impl Odometry {
             features: detected.features,
             tracks: &tracks,
             update: update.as_ref(),
-            followed: followed.as_ref(),
-            is_followed: run.track_window.connected() >= config.ransac.min_inliers,
+            followed: &followed,
         };
         stats.count(&seen, &window);
         run.watch(&seen, &view, supervisor, config);

@@ -9,13 +9,11 @@ use super::recognition::spread_of_recognition;
 use super::report::{KeypointRole, KeypointView, Note, StageTimes, StepCounts, StepReport};
 use super::rest::RestDetector;
 use super::restart::Spread;
-use super::supervisor::{FrameEvidence, PoseVerdict, Supervisor};
+use super::supervisor::{Followed, FrameEvidence, PoseVerdict, Supervisor};
 use super::track_window::{TrackFrame, TrackWindow};
 use super::window::{ImuCursor, ImuWindow};
 use crate::fault::Obstruction;
-use crate::filter::{
-    Calibration, FilterConfig, MountedCamera, PointObservation, PointUpdate, TrackUpdate,
-};
+use crate::filter::{Calibration, FilterConfig, MountedCamera, PointObservation, PointUpdate};
 use crate::inertial::{Belief, NavCovariance};
 use crate::map::{ReferenceView, Sighting};
 use crate::sensor::Stamp;
@@ -176,15 +174,14 @@ impl Run {
         updated.inspect_err(|error| tracing::debug!("no update: {error}")).ok()
     }
 
-    /// Conditions the belief on points that were followed through past poses; `None` if nothing of it
-    /// was due, or it was refused.
+    /// Conditions the belief on points that were followed through past poses, as far as they are due.
     pub fn use_followed(
         &mut self,
         front: &FrontEndFrame,
         tracks: &Tracks,
         view: &View,
         time: Stamp,
-    ) -> Option<TrackUpdate> {
+    ) -> Followed {
         let features = &front.extraction.features;
         let measured: Vec<_> =
             tracks.agreeing().filter_map(|m| Some(features.get(m.feature)?.pixel)).collect();
@@ -197,7 +194,9 @@ impl Run {
             view,
         };
         let updated = self.back_end.update_tracks(&mut self.track_window, &frame);
-        updated.inspect_err(|error| tracing::debug!("no use of tracks: {error}")).ok()?
+        let updated = updated.inspect_err(|error| tracing::debug!("no use of tracks: {error}"));
+        let ties = self.track_window.connected() >= view.config.ransac.min_inliers;
+        Followed { update: updated.ok().flatten(), ties }
     }
 
     /// Compares the turns that the images and the gyroscope see. Gives how much the clocks turn out
@@ -235,7 +234,8 @@ impl Run {
         }
         self.levelling.weigh(self.back_end.belief(), seen.contradicts(), &config.imu);
         supervisor.observe_world_turn(seen.update.and_then(|update| update.frame.world_turn));
-        supervisor.observe_world_turn(seen.followed.and_then(|update| update.frame.world_turn));
+        supervisor
+            .observe_world_turn(seen.followed.update.as_ref().and_then(|u| u.frame.world_turn));
         supervisor.judge_belief(stamp, self.belief(), seen.nis());
         self.seeing_frames += u64::from(!supervisor.is_lost());
         if self.gives_up_map(seen.visible, seen.update.is_some(), config.map.max_unseen_frames) {

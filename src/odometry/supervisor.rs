@@ -34,23 +34,29 @@ pub(super) struct FrameEvidence<'a> {
     pub features: usize,
     pub tracks: &'a Tracks,
     pub update: Option<&'a PointUpdate>,
-    /// What points told that were followed through past poses.
-    pub followed: Option<&'a TrackUpdate>,
+    pub followed: &'a Followed,
+}
+
+/// What points told of a frame that were followed through past poses.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Followed {
+    /// `None` if nothing of them was due.
+    pub update: Option<TrackUpdate>,
     /// Whether enough of them tie the frame to such a pose.
-    pub is_followed: bool,
+    pub ties: bool,
 }
 
 impl FrameEvidence<'_> {
     /// Whether what was seen contradicts the prediction.
     pub fn contradicts(&self) -> bool {
         self.update.is_some_and(PointUpdate::contradicts)
-            || self.followed.is_some_and(|followed| followed.contradicted)
+            || self.followed.update.as_ref().is_some_and(|update| update.contradicted)
     }
 
     /// The normalised innovation squared of what was seen: of the map, if that was.
     pub fn nis(&self) -> Option<f64> {
-        let followed = self.followed.filter(|followed| followed.rows > 0);
-        self.update.map(|update| update.nis).or(followed.map(|followed| followed.nis))
+        let followed = self.followed.update.as_ref().filter(|update| update.rows > 0);
+        self.update.map(|update| update.nis).or(followed.map(|update| update.nis))
     }
 }
 
@@ -238,7 +244,7 @@ impl Supervisor {
             features: evidence.features,
             matches: evidence.tracks.matches.len(),
             inliers: evidence.tracks.inliers.len(),
-            updated: evidence.update.is_some() || evidence.is_followed,
+            updated: evidence.update.is_some() || evidence.followed.ties,
         };
         self.notes.extend(self.health.see(evidence.stamp, sight));
     }
