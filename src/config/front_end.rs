@@ -20,7 +20,10 @@ impl Config {
             return Ok(VisualFrontEnd::new(orb));
         }
         let Self { tracker, features, camera, depth, imu, .. } = self;
-        let tracker = Tracker::new(tracker, features, camera, depth, imu)?.masked(mask);
+        let others = self.log.stereo.get(1..).unwrap_or_default();
+        let tracker = Tracker::new(tracker, features, camera, depth, imu)?
+            .masked(mask)
+            .with_others(camera, others)?;
         Ok(VisualFrontEnd::new(orb).tracking(tracker))
     }
 }

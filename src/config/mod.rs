@@ -145,6 +145,7 @@ impl Config {
         OdometryConfig {
             imu: self.imu.clone(),
             camera: self.camera.clone(),
+            others: self.log.stereo.get(1..).unwrap_or_default().to_vec(),
             depth: self.depth.clone(),
             search: self.search.clone(),
             matching: self.matching.clone(),

@@ -438,6 +438,13 @@ impl Layers {
         };
         let before = self.conflicts.len();
         self.camera(&camera, &Origin::Log("rectified from the two cameras".to_owned()));
+        if let [left, right] = &summary.stereo[..]
+            && log.stereo != summary.stereo
+            && let Ok(cameras) = toml::Value::try_from([left, right])
+        {
+            let origin = Origin::Log("calibrations of the two cameras".to_owned());
+            self.put("log.stereo".to_owned(), cameras, origin);
+        }
         self.conflicts.truncate(before);
         Ok(())
     }

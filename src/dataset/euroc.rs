@@ -72,7 +72,9 @@ pub(super) fn list(folder: &Path, config: &LogConfig) -> Result<(LogSummary, Lis
     let mut sources = vec![("color", LEFT), (if has_depth { "depth" } else { "right" }, second)];
     sources.extend(has_imu.then_some(("imu", IMU)));
     sources.extend(truth.map(|name| ("truth", name)));
+    let stereo = listing.stereo.as_ref().map(|rig| rig.cameras().to_vec()).unwrap_or_default();
     let summary = LogSummary {
+        stereo,
         kind: if has_depth { "EuRoC-like RGB-D folder" } else { "EuRoC folder" }.to_owned(),
         config_name: if has_depth { "generic" } else { "euroc" }.to_owned(),
         has_imu,

@@ -55,6 +55,9 @@ pub struct LogSummary {
     pub frames: Option<u64>,
     /// Calibration of the color camera and its mounting on the IMU, where the log tells both.
     pub camera: Option<CameraConfig>,
+    /// The left and the right camera, where depth comes from two.
+    #[serde(skip)]
+    pub stereo: Vec<CameraConfig>,
     /// What its messages tell of calibrations.
     pub calibration: FoundCalibration,
     /// For a role, the topics that could have played it, too, with their rates.

@@ -12,7 +12,8 @@ use crate::sensor::{ColorImage, DepthImage, GnssFix, ImuSample, MagneticSample, 
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Reading {
     Color(Stamp, ColorImage),
-    /// Of the right one of two cameras; [`StereoSource`](super::stereo::StereoSource) takes it.
+    /// Of the right one of two cameras; [`StereoSource`](super::stereo::StereoSource) gives it the
+    /// stamp of the left one.
     Right(Stamp, ColorImage),
     Depth(Stamp, DepthImage),
     Imu(ImuSample),
@@ -287,6 +288,8 @@ struct ReorderBuffer {
     /// Events of an instant come in this order: IMU, truth, frame.
     events: BTreeMap<(Stamp, u8), Event>,
     images: Pairer<ColorImage, DepthImage>,
+    /// Stamped as the color image that they belong to.
+    rights: BTreeMap<Stamp, ColorImage>,
     ready: VecDeque<Event>,
     /// How long a reading waits for others, ns.
     delay: i64,
@@ -303,6 +306,7 @@ impl ReorderBuffer {
         Self {
             events: BTreeMap::new(),
             images: Pairer::new(pair_limit),
+            rights: BTreeMap::new(),
             ready: VecDeque::new(),
             delay: window.saturating_add(pair_limit.saturating_mul(2)),
             latest: Stamp::from_nanos(i64::MIN),
@@ -333,10 +337,7 @@ impl ReorderBuffer {
             Reading::Depth(stamp, image) => self.images.add_depth(stamp, image),
             Reading::Imu(sample) => self.add_event(0, Event::Imu(sample)),
             Reading::Truth(pose) => self.add_event(1, Event::Truth(pose)),
-            Reading::Right(..) => {
-                report.skip_at("right image: no calibration", stamp);
-                return;
-            }
+            Reading::Right(stamp, image) => self.rights.insert(stamp, image).is_none(),
             Reading::Gyroscope(..)
             | Reading::Accelerometer(..)
             | Reading::Gnss(_)
@@ -401,11 +402,13 @@ impl ReorderBuffer {
     }
 
     fn release(&mut self, until: Stamp, report: &mut ReadReport) {
-        let Self { images, events, ready, size, .. } = self;
+        let Self { images, rights, events, ready, size, .. } = self;
         images.settle(until, |paired| match paired {
             Paired::Pair(stamp, color, depth) => {
                 *size = size.saturating_sub(color_size(&color) + depth_size(&depth));
-                if let Some(frame) = registered(stamp, color, depth, report) {
+                let others: Vec<ColorImage> = rights.remove(&stamp).into_iter().collect();
+                *size = size.saturating_sub(others.iter().map(color_size).sum());
+                if let Some(frame) = registered(stamp, color, depth, others, report) {
                     *size += ENTRY_SIZE;
                     events.insert((stamp, 2), Event::Frame(Box::new(frame)));
                 }
@@ -421,6 +424,10 @@ impl ReorderBuffer {
                 report.skip_at(reason, stamp);
             }
         });
+        // Those whose color image never came.
+        while let Some(entry) = rights.first_entry().filter(|entry| *entry.key() <= until) {
+            *size = size.saturating_sub(color_size(&entry.remove()));
+        }
         while let Some(entry) = events.first_entry() {
             if entry.key().0 > until {
                 break;
@@ -437,6 +444,7 @@ fn registered(
     stamp: Stamp,
     color: ColorImage,
     depth: DepthImage,
+    others: Vec<ColorImage>,
     report: &mut ReadReport,
 ) -> Option<RgbdFrame> {
     let (color_size, depth_size) =
@@ -446,7 +454,7 @@ fn registered(
         report.skip("frame: color and depth differ in size", detail);
         return None;
     }
-    Some(RgbdFrame { stamp, color, depth, others: Vec::new() })
+    Some(RgbdFrame { stamp, color, depth, others })
 }
 
 #[cfg(test)]

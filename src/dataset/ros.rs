@@ -808,6 +808,7 @@ impl Survey {
                 .cloned(),
             frames: None,
             camera: rig.map(StereoRig::camera).or(self.camera.as_ref()).cloned(),
+            stereo: rig.map(|rig| rig.cameras().to_vec()).unwrap_or_default(),
             calibration: self.calibration(chosen),
             others: chosen
                 .keys()

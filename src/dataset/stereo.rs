@@ -1,4 +1,4 @@
-//! Pairs of images of two cameras to color and depth.
+//! Pairs of images of two cameras to color and depth, the right one beside them.
 
 use std::collections::VecDeque;
 
@@ -8,7 +8,8 @@ use super::{LogConfig, ReadReport};
 use crate::sensor::{ColorImage, Stamp};
 use crate::vision::StereoRig;
 
-/// Replaces the images of the two cameras by the rectified left one and its depth.
+/// Replaces the left image by the rectified one and its depth; the right one stays as taken, with the
+/// stamp of the left one.
 pub(super) struct StereoSource<S> {
     source: S,
     rig: StereoRig,
@@ -39,6 +40,7 @@ impl<S: ReadingSource> StereoSource<S> {
         pairs.settle(until, |paired| match paired {
             Paired::Pair(stamp, left, right) => match rig.measure(&left, &right) {
                 Some((color, depth)) => {
+                    ready.push_back(Reading::Right(stamp, right));
                     ready.push_back(Reading::Color(stamp, color));
                     ready.push_back(Reading::Depth(stamp, depth));
                 }

@@ -15,6 +15,9 @@ use serde::{Deserialize, Serialize};
 pub struct OdometryConfig {
     pub imu: ImuConfig,
     pub camera: CameraConfig,
+    /// Further cameras of the body, by their index less one, whose images as taken come with those of
+    /// `camera`; a log without such images does not use them.
+    pub others: Vec<CameraConfig>,
     pub depth: DepthConfig,
     pub search: SearchConfig,
     pub matching: MatchingConfig,

@@ -65,6 +65,8 @@ pub enum VisionError {
     Config { key: &'static str, value: f64, expected: &'static str },
     #[error("tracker.{key} = {value}: must be {expected}")]
     Tracker { key: &'static str, value: f64, expected: &'static str },
+    #[error("camera.imu_from_camera or that of a further camera is no rigid transform")]
+    Mounting,
     #[error(transparent)]
     Mask(#[from] MaskError),
     #[error("camera.{0}")]

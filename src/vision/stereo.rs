@@ -56,6 +56,8 @@ pub enum StereoError {
 #[derive(Debug, Clone)]
 pub struct StereoRig {
     size: (usize, usize),
+    /// As given: left and right.
+    cameras: [CameraConfig; 2],
     /// Of the images of [`Self::measure`].
     camera: CameraConfig,
     /// Of the images that are matched.
@@ -161,6 +163,7 @@ impl StereoRig {
         };
         Ok(Self {
             size,
+            cameras: [left.clone(), right.clone()],
             left: map(&left_lens, &left_from_rectified),
             right: map(&right_lens, &rectification.right_from_rectified),
             camera: rectification.camera,
@@ -168,6 +171,11 @@ impl StereoRig {
             baseline,
             wide: left.model.is_wide().then_some((left_lens, left_from_rectified)),
         })
+    }
+
+    /// The left and the right camera, whose images are those as taken.
+    pub fn cameras(&self) -> &[CameraConfig; 2] {
+        &self.cameras
     }
 
     /// The camera of the images of [`Self::measure`]: see [`rectified_camera`].

@@ -161,6 +161,14 @@ impl Template {
         noise * (2.0 / smaller.max(f32::MIN_POSITIVE)).sqrt()
     }
 
+    /// Normalised cross-correlation with the window around `place`; `None` over the border.
+    pub fn correlation(&self, image: Grey, place: Vector2<f32>) -> Option<f32> {
+        let mut seen = window(image, place)?;
+        take_mean_off(&mut seen);
+        let correlation = dot(&self.values, &seen) / (dot(&seen, &seen).sqrt() * self.spread);
+        correlation.is_finite().then_some(correlation)
+    }
+
     /// The place nearest to `start` that shows the same. `None` where the window leaves the image or
     /// the search does not come to an end.
     pub fn find(&self, image: Grey, start: Vector2<f32>, search: Search) -> Option<Found> {

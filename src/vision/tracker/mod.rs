@@ -4,9 +4,12 @@
 //! aligning its first view, coarse to fine ([`alignment`]); the first view stays the reference, so that
 //! nothing drifts. What is found must lead back to where the point was, and move with most others as a
 //! rigid scene does ([`epipolar`]). Cells of the image that hold no point get a new one ([`corners`]).
+//! In the images of further cameras it is sought on its epipolar line ([`across`]).
 
 mod config;
 
+#[cfg(feature = "vision")]
+mod across;
 #[cfg(feature = "vision")]
 mod alignment;
 #[cfg(feature = "vision")]

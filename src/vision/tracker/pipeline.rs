@@ -4,6 +4,7 @@ use opencv::core::{Mat, Point2d, Vector};
 use opencv::prelude::*;
 
 use super::TrackerConfig;
+use super::across::{OtherCamera, OtherView};
 use super::corners::{CornerFinder, Wanted};
 use super::epipolar::{self, Pair};
 use super::levels::Levels;
@@ -37,6 +38,7 @@ pub struct Tracker {
     depth: DepthConfig,
     mask: Mask,
     gyroscope: Option<Gyroscope>,
+    others: Vec<OtherCamera>,
     corners: CornerFinder,
     present: Levels,
     former: Levels,
@@ -81,6 +83,7 @@ impl Tracker {
             depth: depth.clone(),
             mask: Mask::default(),
             gyroscope: Gyroscope::new(camera, imu),
+            others: Vec::new(),
             corners: CornerFinder::new(features)?,
             present: Levels::default(),
             former: Levels::default(),
@@ -97,6 +100,20 @@ impl Tracker {
         Self { mask, ..self }
     }
 
+    /// The same for a body with further cameras, whose images come in
+    /// [`others`](RgbdFrame::others); `first` is the one that the tracker was made for.
+    ///
+    /// # Errors
+    /// [`VisionError`] for cameras that cannot be.
+    pub fn with_others(
+        self,
+        first: &CameraConfig,
+        others: &[CameraConfig],
+    ) -> Result<Self, VisionError> {
+        let others = others.iter().map(|other| OtherCamera::new(first, other));
+        Ok(Self { others: others.collect::<Result<_, _>>()?, ..self })
+    }
+
     /// The turn up to the next frame is predicted by it.
     pub fn imu(&mut self, sample: &ImuSample) {
         if let Some(gyroscope) = &mut self.gyroscope {
@@ -110,49 +127,56 @@ impl Tracker {
     /// [`VisionError`] if OpenCV refuses the image.
     pub fn track(&mut self, frame: &RgbdFrame) -> Result<Vec<TrackedFeature>, VisionError> {
         self.frames += 1;
-        match self.advance(frame)? {
-            Some(motion) => {
+        let (motion, continues) = self.advance(frame)?;
+        match continues {
+            true => {
                 self.follow(&motion);
                 self.drop_outliers(&motion)?;
                 self.drop_coinciding();
                 self.renew_noise();
             }
-            None => self.tracks.clear(),
+            false => self.tracks.clear(),
         }
         self.fill()?;
-        Ok(self.report(frame))
+        self.report(frame, &motion)
     }
 
-    /// Takes the images of a frame; how it follows on the one before, if it does.
-    fn advance(&mut self, frame: &RgbdFrame) -> Result<Option<ImageMotion>, VisionError> {
+    /// Takes the images of a frame; how they follow on those before, and whether they do.
+    fn advance(&mut self, frame: &RgbdFrame) -> Result<(ImageMotion, bool), VisionError> {
         std::mem::swap(&mut self.present, &mut self.former);
         let levels = usize::from(self.config.levels);
         self.present.fill(&frame.color, levels, LEAST_SIDE)?;
         let last = self.last.replace(frame.stamp);
         let (now, before) = (self.present.level(0), self.former.level(0));
         let is_alike = (now.width, now.height) == (before.width, before.height);
-        let Some(last) = last.filter(|_| is_alike) else { return Ok(None) };
+        let last = last.filter(|_| is_alike).unwrap_or(frame.stamp);
         let seconds = frame.stamp.seconds_since(last);
-        let turn = self.gyroscope.as_ref().and_then(|gyro| gyro.turn(last, frame.stamp));
-        Ok((seconds > 0.0 && seconds <= LONGEST_INTERVAL).then_some(ImageMotion {
+        let motion = ImageMotion {
             camera: self.camera,
-            turn,
+            turn: self.gyroscope.as_ref().and_then(|gyro| gyro.turn(last, frame.stamp)),
             seconds,
             readout_time: self.readout_time,
             height: now.height as f64,
-        }))
+        };
+        Ok((motion, seconds > 0.0 && seconds <= LONGEST_INTERVAL))
     }
 
     fn follow(&mut self, motion: &ImageMotion) {
-        let frame = Frame {
+        let mut tracks = std::mem::take(&mut self.tracks);
+        let frame = self.frame(motion);
+        tracks.retain_mut(|track| track.follow(&frame));
+        self.tracks = tracks;
+    }
+
+    fn frame<'a>(&'a self, motion: &'a ImageMotion) -> Frame<'a> {
+        Frame {
             config: &self.config,
             mask: &self.mask,
             present: &self.present,
             former: &self.former,
             motion,
             noise_variance: self.noise * self.noise,
-        };
-        self.tracks.retain_mut(|track| track.follow(&frame));
+        }
     }
 
     /// Drops points that do not move as most of them do.
@@ -230,16 +254,48 @@ impl Tracker {
         Ok(())
     }
 
-    fn report(&self, frame: &RgbdFrame) -> Vec<TrackedFeature> {
-        let feature = |track: &Track| TrackedFeature {
-            id: track.id,
-            camera: 0,
-            pixel: track.pixel,
-            pixel_covariance: track.covariance,
-            depth: self.depth.read(&frame.depth, track.pixel),
-            descriptor: None,
-        };
-        self.tracks.iter().filter(|track| track.is_seen()).map(feature).collect()
+    /// The points that are seen, by the first camera and by the others.
+    fn report(
+        &mut self,
+        frame: &RgbdFrame,
+        motion: &ImageMotion,
+    ) -> Result<Vec<TrackedFeature>, VisionError> {
+        let levels = usize::from(self.config.levels);
+        let mut others = std::mem::take(&mut self.others);
+        for (other, image) in others.iter_mut().zip(&frame.others) {
+            other.take(image, levels, LEAST_SIDE)?;
+        }
+        let looks = &others[..others.len().min(frame.others.len())];
+        let mut tracks = std::mem::take(&mut self.tracks);
+        let shared = self.frame(motion);
+        let mut found = Vec::with_capacity(tracks.len() * (1 + looks.len()));
+        for track in tracks.iter_mut().filter(|track| track.is_seen()) {
+            let feature = |camera: usize, pixel: Point2<f64>, covariance: Matrix2<f64>| {
+                // A depth that the other cameras gave says nothing new.
+                let has_depth = camera == 0 && looks.is_empty();
+                let depth = has_depth.then(|| self.depth.read(&frame.depth, pixel)).flatten();
+                let pixel_covariance = covariance;
+                TrackedFeature {
+                    id: track.id,
+                    camera,
+                    pixel,
+                    pixel_covariance,
+                    depth,
+                    descriptor: None,
+                }
+            };
+            found.push(feature(0, track.pixel, track.covariance));
+            let mut inverse_depth = track.inverse_depth;
+            for (index, other) in looks.iter().enumerate() {
+                let Some(view) = other.find(&shared, track) else { continue };
+                let OtherView { pixel, covariance, .. } = view;
+                inverse_depth = Some(view.inverse_depth);
+                found.push(feature(1 + index, pixel, covariance));
+            }
+            track.inverse_depth = inverse_depth;
+        }
+        (self.tracks, self.others) = (tracks, others);
+        Ok(found)
     }
 }
 

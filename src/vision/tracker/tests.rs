@@ -342,3 +342,78 @@ fn configurations_that_cannot_be_are_refused() {
     assert!(refused(TrackerConfig { pixel_sigma: 0.0, ..default() }).contains("above 0"));
     assert!(refused(TrackerConfig { min_correlation: 1.0, ..default() }).contains("-1 to 1"));
 }
+
+/// Views of a pair of cameras: how far those of the second one are from the truth (px, and as
+/// chi-square over the covariance), and how many points it was found for.
+fn stereo_misses(other: &CameraConfig, frames: usize) -> (Vec<f64>, Vec<f64>, f64) {
+    let config = TrackerConfig { pixel_sigma: 0.02, ..TrackerConfig::default() };
+    let mut tracker = tracker(&config).with_others(&camera(), &[other.clone()]).unwrap();
+    let (first, second) = (Camera::new(&camera()).unwrap(), Camera::new(other).unwrap());
+    let mounting = other.imu_from_camera().unwrap();
+    let scene = Scene::default();
+    let (mut errors, mut chi_squares, mut seen) = (vec![], vec![], 0);
+    for index in 0..frames {
+        let pose = handheld(index as f64 * STEP);
+        feed(&mut tracker, handheld, index as f64 * STEP);
+        let pose_of_other = pose * mounting;
+        let mut frame = frame(index, grey(&scene.render(&pose, &first, index as u64), 1.0, 0.0));
+        let seed = 1000 + index as u64;
+        frame.others = vec![grey(&scene.render(&pose_of_other, &second, seed), 0.8, 10.0)];
+        let tracks = tracker.track(&frame).unwrap();
+        seen += tracks.iter().filter(|track| track.camera == 0).count();
+        for pair in tracks.windows(2).filter(|pair| pair[1].camera == 1) {
+            assert_eq!(pair[0].id, pair[1].id);
+            assert_eq!(pair[1].depth, None);
+            let ray = first.unproject(pair[0].pixel, 1.0).unwrap();
+            let point = scene.hit(&pose, &ray).0;
+            let expected =
+                second.project(&pose_of_other.inverse_transform_point(&point.into()).coords);
+            let error = pair[1].pixel - expected.unwrap();
+            errors.push(error.norm());
+            let covariance = pair[1].pixel_covariance + pair[0].pixel_covariance;
+            chi_squares.push((error.transpose() * covariance.try_inverse().unwrap() * error).x);
+        }
+    }
+    let share = errors.len() as f64 / seen as f64;
+    (errors, chi_squares, share)
+}
+
+fn mounted(camera: CameraConfig, position: Vector3<f64>, turn: Vector3<f64>) -> CameraConfig {
+    let mounting =
+        Isometry3::from_parts(Translation3::from(position), UnitQuaternion::from_scaled_axis(turn));
+    let matrix = mounting.to_homogeneous();
+    let imu_from_camera = std::array::from_fn(|i| std::array::from_fn(|j| matrix[(i, j)]));
+    CameraConfig { imu_from_camera, ..camera }
+}
+
+/// Beside the first camera, wide apart, above it, turned towards it, with another lens.
+#[test]
+fn other_cameras_see_points_on_their_epipolar_lines() {
+    let other_lens = CameraConfig {
+        fx: 310.0,
+        fy: 308.0,
+        cx: 165.0,
+        cy: 117.0,
+        distortion: vec![-0.2, 0.04, 1e-3, -5e-4],
+        ..camera()
+    };
+    for (what, other) in [
+        ("beside", mounted(camera(), Vector3::new(0.11, 0.0, 0.0), Vector3::zeros())),
+        ("wide", mounted(camera(), Vector3::new(0.4, 0.01, 0.0), Vector3::new(0.0, -0.1, 0.0))),
+        ("above", mounted(camera(), Vector3::new(0.01, -0.12, 0.0), Vector3::new(0.0, 0.0, 0.02))),
+        ("unequal", mounted(other_lens, Vector3::new(-0.1, 0.02, 0.01), Vector3::repeat(0.02))),
+    ] {
+        let (errors, chi_squares, share) = stereo_misses(&other, 12);
+        let wrong =
+            errors.iter().filter(|error| **error > 1.0).count() as f64 / errors.len() as f64;
+        let (median, most) = (quantile(errors.clone(), 0.5), quantile(errors.clone(), 0.99));
+        let chi_square = quantile(chi_squares, 0.5);
+        eprintln!(
+            "{what}: share {share:.2} median {median:.3} 99 % {most:.3} wrong {wrong:.4} chi {chi_square:.2}"
+        );
+        assert!(share > 0.6, "{what}: {share}");
+        assert!(median < 0.08 && wrong < 0.005, "{what}: {median} {most} {wrong}");
+        // The median of two degrees of freedom is 1.4.
+        assert!((0.4..3.0).contains(&chi_square), "{what}: {chi_square}");
+    }
+}

@@ -52,6 +52,8 @@ pub(super) struct Track {
     pub unseen: f64,
     /// Variance of the grey values where it was found last.
     pub noise_variance: f32,
+    /// Where other cameras saw it last, 1/m; 0 at infinity.
+    pub inverse_depth: Option<f64>,
     /// Whether it was found in the frame before, so that its motion is known.
     is_steady: bool,
 }
@@ -88,6 +90,7 @@ impl Track {
             drift: Vector2::zeros(),
             unseen: 0.0,
             noise_variance: 0.0,
+            inverse_depth: None,
             is_steady: false,
         })
     }
