@@ -69,7 +69,7 @@ fn camera() -> CameraConfig {
 
 fn tracker() -> Tracker {
     let (features, depth) = (FeatureConfig::default(), DepthConfig::default());
-    let config = TrackerConfig::default();
+    let config = TrackerConfig { points: 200, ..TrackerConfig::default() };
     Tracker::new(&config, &features, &camera(), &depth, &ImuConfig::default()).expect("defaults")
 }
 

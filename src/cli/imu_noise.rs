@@ -7,6 +7,7 @@ use mfg_vio::inertial::identification::{AxisNoise, Coefficient, ImuNoise};
 use mfg_vio::output;
 use mfg_vio::replay::{InertialInput, NoiseSettings, noise_of_log};
 
+use super::argument::seconds;
 use super::terminal::print;
 
 /// Measure the noise of an IMU on a log of it at rest: Allan deviation, densities, vibrations.
@@ -51,15 +52,6 @@ pub struct Args {
     /// Print everything as one JSON object.
     #[arg(long)]
     json: bool,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
-    if value >= 0.0 && value.is_finite() {
-        Ok(value)
-    } else {
-        Err("must not be negative".to_owned())
-    }
 }
 
 pub fn run(args: &Args) -> anyhow::Result<()> {

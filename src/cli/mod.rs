@@ -1,5 +1,6 @@
 //! The commands: one file each, each a thin shell over the library.
 
+mod argument;
 mod attitude;
 #[cfg(feature = "vision")]
 mod bench;

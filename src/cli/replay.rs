@@ -4,6 +4,7 @@ use anyhow::Context;
 use indicatif::ProgressBar;
 use nalgebra::Isometry3;
 
+use super::argument::seconds;
 use super::terminal::{INTERRUPTED, catch_interrupts, print, progress};
 use mfg_vio::config::{Config, Origin, Resolved};
 use mfg_vio::dataset::{Fault, LogSummary};
@@ -97,13 +98,6 @@ pub struct Settings {
 impl Settings {
     pub fn overrides(&self) -> &[String] {
         &self.overrides
-    }
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(value) if value >= 0.0 => Ok(value),
-        _ => Err("expected a number of seconds, 0 or more".to_owned()),
     }
 }
 

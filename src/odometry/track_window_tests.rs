@@ -12,7 +12,7 @@ use super::track_window::{TrackFrame, TrackWindow};
 use super::{InitMode, Odometry, OdometryConfig, StepReport};
 use crate::filter::{
     FilterConfig, FilterError, FilterKind, InertialStep, KnownAttitude, MountedCamera,
-    TrackOutcome, VisualInertialFilter,
+    TrackOutcome, TrackUpdate, VisualInertialFilter,
 };
 use crate::inertial::{Belief, ImuConfig, NavCovariance, NavState, Propagator, block};
 use crate::sensor::{
@@ -145,7 +145,7 @@ impl HallRun {
         let mut seen = BTreeMap::new();
         for (k, landmark) in self.landmarks.clone().into_iter().enumerate() {
             let at = world_from_camera.inverse_transform_point(&Point3::from(landmark)).coords;
-            let Some(pixel) = camera.project(&at).filter(|pixel| is_in_image(pixel)) else {
+            let Some(pixel) = camera.project(&at).filter(is_in_image) else {
                 continue;
             };
             if k < self.hall.corners {

@@ -21,6 +21,10 @@ fn camera() -> CameraConfig {
     CameraConfig { fx: 260.0, fy: 262.0, cx: 158.0, cy: 121.0, ..CameraConfig::default() }
 }
 
+fn on() -> TrackerConfig {
+    TrackerConfig { points: 200, ..TrackerConfig::default() }
+}
+
 fn tracker(config: &TrackerConfig) -> Tracker {
     let (features, depth) = (FeatureConfig::default(), DepthConfig::default());
     Tracker::new(config, &features, &camera(), &depth, &ImuConfig::default()).unwrap()
@@ -202,7 +206,7 @@ fn norms<'a>(misses: impl Iterator<Item = &'a Miss>) -> Vec<f64> {
 #[test]
 fn points_are_followed_without_drift() {
     // The wall is what the model of a point's surroundings takes it for.
-    let config = TrackerConfig { pixel_sigma: 0.01, ..TrackerConfig::default() };
+    let config = TrackerConfig { pixel_sigma: 0.01, ..on() };
     let frames = misses(&mut tracker(&config), 60, handheld, plain(Scene::default), true);
     let later = || frames.iter().flatten().filter(|miss| miss.age > 0);
     let counts: Vec<usize> = frames.iter().map(Vec::len).collect();
@@ -230,7 +234,7 @@ fn exposure_may_change() {
         let gain = rng.random_range(0.5..1.0);
         (Scene::default(), grey(&image, gain, rng.random_range(-20.0..30.0)))
     };
-    let frames = misses(&mut tracker(&TrackerConfig::default()), 30, handheld, show, true);
+    let frames = misses(&mut tracker(&on()), 30, handheld, show, true);
     let errors = norms(frames.iter().flatten().filter(|miss| miss.age > 0));
     let old = frames[29].iter().filter(|miss| miss.age > 20).count();
     assert!(old > 80, "{old}");
@@ -245,7 +249,7 @@ fn quick_turns_are_predicted() {
         let turn = Vector3::new(0.0, 0.22 * (10.0 * seconds).sin(), 0.0);
         Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_scaled_axis(turn))
     };
-    let config = TrackerConfig { levels: 2, ..TrackerConfig::default() };
+    let config = TrackerConfig { levels: 2, ..on() };
     let kept = |has_gyroscope: bool| {
         let show = plain(Scene::default);
         let frames = misses(&mut tracker(&config), 8, turn, show, has_gyroscope);
@@ -268,7 +272,7 @@ fn what_is_covered_is_not_followed() {
         let image = scene(index).render(pose, &lens, index as u64);
         (scene(index), grey(&image, 1.0, 0.0))
     };
-    let frames = misses(&mut tracker(&TrackerConfig::default()), 40, handheld, show, true);
+    let frames = misses(&mut tracker(&on()), 40, handheld, show, true);
     let errors = norms(frames.iter().flatten().filter(|miss| miss.age > 0));
     let wrong = errors.iter().filter(|error| **error > 1.0).count();
     // Points of the screen itself move, and are outliers to the wall.
@@ -279,7 +283,7 @@ fn what_is_covered_is_not_followed() {
 fn the_same_log_gives_the_same_points() {
     let lens = Camera::new(&camera()).unwrap();
     let run = || {
-        let mut tracker = tracker(&TrackerConfig::default());
+        let mut tracker = tracker(&on());
         let mut all = vec![];
         for index in 0..10 {
             let pose = handheld(index as f64 * STEP);
@@ -296,7 +300,7 @@ fn the_same_log_gives_the_same_points() {
 fn masks_jumps_and_the_dark_are_honoured() {
     let lens = Camera::new(&camera()).unwrap();
     let mask: Mask = MaskConfig::Regions(vec![[100, 60, 90, 70]]).load().unwrap();
-    let mut tracker = tracker(&TrackerConfig::default()).masked(mask.clone());
+    let mut tracker = tracker(&on()).masked(mask.clone());
     let mut show = |index: usize, number: usize| {
         let pose = handheld(index as f64 * STEP);
         let image = grey(&Scene::default().render(&pose, &lens, index as u64), 1.0, 0.0);
@@ -334,7 +338,7 @@ fn configurations_that_cannot_be_are_refused() {
         let made = Tracker::new(&config, &features, &camera(), &depth, &ImuConfig::default());
         made.err().unwrap().to_string()
     };
-    let default = TrackerConfig::default;
+    let default = on;
     assert!(refused(TrackerConfig { levels: 0, ..default() }).contains("tracker.levels = 0"));
     assert!(refused(TrackerConfig { levels: 7, ..default() }).contains("1 to 6"));
     assert!(refused(TrackerConfig { cell_size: 1.0, ..default() }).contains("cell_size"));
@@ -346,8 +350,8 @@ fn configurations_that_cannot_be_are_refused() {
 /// Views of a pair of cameras: how far those of the second one are from the truth (px, and as
 /// chi-square over the covariance), and how many points it was found for.
 fn stereo_misses(other: &CameraConfig, frames: usize) -> (Vec<f64>, Vec<f64>, f64) {
-    let config = TrackerConfig { pixel_sigma: 0.02, ..TrackerConfig::default() };
-    let mut tracker = tracker(&config).with_others(&camera(), &[other.clone()]).unwrap();
+    let config = TrackerConfig { pixel_sigma: 0.02, ..on() };
+    let mut tracker = tracker(&config).with_others(&camera(), std::slice::from_ref(other)).unwrap();
     let (first, second) = (Camera::new(&camera()).unwrap(), Camera::new(other).unwrap());
     let mounting = other.imu_from_camera().unwrap();
     let scene = Scene::default();
