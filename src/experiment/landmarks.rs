@@ -69,7 +69,7 @@ impl LandmarkRun {
     pub fn see(&mut self, measure: impl Fn(&BackEnd) -> Vec<Seen>) {
         let (again, _) = self.sorted(&measure(&self.back_end));
         // A frame without a known landmark corrects nothing.
-        let _ = self.back_end.update(self.frame, &again);
+        let _ = self.back_end.update(self.frame, &again, false);
         let (again, fresh) = self.sorted(&measure(&self.back_end));
         let camera = self.back_end.belief().state.world_from_body.translation.vector;
         let sighting = sighting(self.frame, camera);

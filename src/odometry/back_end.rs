@@ -116,10 +116,15 @@ impl BackEnd {
     }
 
     /// Conditions belief and map on points of the map that were seen in a frame.
+    ///
+    /// A belief that `is_tied` to past poses by points that were followed from there is not lost, even
+    /// if none of its points is seen. It must not be led back to the map: that takes the map's errors for
+    /// independent of its own, which they are only after a loss.
     pub fn update(
         &mut self,
         frame: u64,
         seen: &[PointObservation],
+        is_tied: bool,
     ) -> Result<PointUpdate, FilterError> {
         self.admit_prior_points(seen);
         let pairs: Vec<_> = seen.iter().filter_map(|point| self.pair(point)).collect();
@@ -127,6 +132,7 @@ impl BackEnd {
             Some(points) if seen.iter().any(|point| points.estimate(point.id).is_some()) => {
                 points.update_state_points(seen)?
             }
+            Some(_) if is_tied => return Err(FilterError::NoMeasurement),
             Some(_) => return self.find_back(frame, seen),
             None => self.filter.update_map_points(&pairs)?,
         };

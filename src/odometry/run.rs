@@ -170,8 +170,13 @@ impl Run {
             .agreeing()
             .map(|m| observation(m.point, in_body(&m.correspondence.measurement, view)))
             .collect();
-        let updated = self.back_end.update(self.seeing_frames, &seen);
+        let updated = self.back_end.update(self.seeing_frames, &seen, self.is_tied(view));
         updated.inspect_err(|error| tracing::debug!("no update: {error}")).ok()
+    }
+
+    /// Whether enough followed points tie the last frame to past poses.
+    fn is_tied(&self, view: &View) -> bool {
+        self.track_window.connected() >= view.config.ransac.min_inliers
     }
 
     /// Conditions the belief on points that were followed through past poses, as far as they are due.
@@ -195,7 +200,7 @@ impl Run {
         };
         let updated = self.back_end.update_tracks(&mut self.track_window, &frame);
         let updated = updated.inspect_err(|error| tracing::debug!("no use of tracks: {error}"));
-        let ties = self.track_window.connected() >= view.config.ransac.min_inliers;
+        let ties = self.is_tied(view);
         Followed { update: updated.ok().flatten(), ties }
     }
 
