@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrackerConfig {
-    /// Points that are followed at once, at most; 0: none are. 200 help where texture is weak or depth
-    /// rare; where both are good they cost time and do not make the estimate better.
+    /// Points that are followed at once, at most; 0: none are. 200 help where texture is weak; where it
+    /// is good they cost time and do not make the estimate better.
     pub points: usize,
     /// Side of the square cells that hold one point each, pixels; 0: such that the image has
     /// `points` of them.
